@@ -1,0 +1,1 @@
+"""A differentiable direct volume renderer in JAX."""

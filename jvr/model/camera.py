@@ -1,0 +1,162 @@
+"""Cameras: where the ray of each pixel starts and where it goes."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from jvr.model.checks import affine, float_array, require
+from jvr.numerics import normalise
+from jvr.types import Affine, Scalar, Triple
+
+
+class AbstractCamera(eqx.Module):
+    """A camera looks along -z of its own frame, y up; pixel (row, column) = (0, 0) is at the top left."""
+
+    world_from_camera: eqx.AbstractVar[Affine]
+    width: eqx.AbstractVar[int]
+    height: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def rays(self, pixels: Int[Array, "rays"]) -> tuple[Triple, Triple]:
+        """World origins and unit directions through the centres of `pixels = row * width + column`; traceable."""
+
+
+class PerspectiveCamera(AbstractCamera):
+    """A pinhole camera.
+
+    **Arguments:** `world_from_camera`: 4x4 rigid transform; `fov_y`: full vertical angle of view in degrees, 0 ... 180;
+    `width`, `height`: pixels (static). Pose and `fov_y` are differentiable.
+    **Raises** `ValueError` for sizes below 1 or an angle out of range.
+    """
+
+    world_from_camera: Affine
+    fov_y: Scalar
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+
+    def __init__(self, world_from_camera: ArrayLike, fov_y: ArrayLike, width: int, height: int):
+        self.world_from_camera = affine(world_from_camera, "world_from_camera")
+        self.fov_y = float_array(fov_y, "fov_y", ())
+        require(self.fov_y, lambda f: (f > 0) & (f < 180), "fov_y is the full vertical angle in degrees and must lie between 0 and 180")
+        self.width, self.height = _size(width, height)
+
+    @classmethod
+    def look_at(
+        cls, eye: ArrayLike, target: ArrayLike, up: ArrayLike, fov_y: ArrayLike, width: int, height: int
+    ) -> "PerspectiveCamera":
+        """The camera at `eye` that looks at `target`; `up` need not be orthogonal to the view. Traceable, differentiable."""
+        return cls(look_at(eye, target, up), fov_y, width, height)
+
+    def rays(self, pixels: Int[Array, "rays"]) -> tuple[Triple, Triple]:
+        x, y = _plane(self, pixels, 2 * jnp.tan(jnp.deg2rad(self.fov_y) / 2))
+        norm = jnp.sqrt(x * x + y * y + 1)
+        direction = _rotate(self.world_from_camera, (x / norm, y / norm, -1 / norm))
+        origin = tuple(jnp.broadcast_to(self.world_from_camera[i, 3], x.shape) for i in range(3))
+        return origin, direction
+
+
+class OrthographicCamera(AbstractCamera):
+    """A camera of parallel rays, which start in its image plane.
+
+    **Arguments:** as `PerspectiveCamera`, with `height_world`, the vertical extent of the picture as a world length.
+    """
+
+    world_from_camera: Affine
+    height_world: Scalar
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+
+    def __init__(self, world_from_camera: ArrayLike, height_world: ArrayLike, width: int, height: int):
+        self.world_from_camera = affine(world_from_camera, "world_from_camera")
+        self.height_world = float_array(height_world, "height_world", ())
+        require(self.height_world, lambda h: h > 0, "height_world must be a positive world length")
+        self.width, self.height = _size(width, height)
+
+    @classmethod
+    def look_at(
+        cls, eye: ArrayLike, target: ArrayLike, up: ArrayLike, height_world: ArrayLike, width: int, height: int
+    ) -> "OrthographicCamera":
+        """The camera whose image plane is centred on `eye` and that looks at `target`; traceable, differentiable."""
+        return cls(look_at(eye, target, up), height_world, width, height)
+
+    def rays(self, pixels: Int[Array, "rays"]) -> tuple[Triple, Triple]:
+        x, y = _plane(self, pixels, self.height_world)
+        offset = _rotate(self.world_from_camera, (x, y, jnp.zeros_like(x)))
+        origin = tuple(offset[i] + self.world_from_camera[i, 3] for i in range(3))
+        forward = _rotate(self.world_from_camera, (jnp.zeros_like(x), jnp.zeros_like(x), -jnp.ones_like(x)))
+        return origin, forward
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Affine:
+    """The `world_from_camera` of a camera at `eye` that looks at `target`: -z forward, y as near to `up` as can be.
+
+    **Raises** `ValueError` where `eye` is `target`, or `up` is parallel to the view. Differentiable in all three.
+    """
+    eye, target, up = (float_array(v, name, (3,)) for v, name in ((eye, "eye"), (target, "target"), (up, "up")))
+    back = normalise(eye - target)
+    side = jnp.cross(normalise(up), back)
+    require(back, lambda b: np.any(b != 0), "look_at needs an eye apart from its target")
+    require(side, lambda r: np.linalg.norm(r) > 1e-6, "look_at needs an up vector that is not parallel to the view: choose another up")
+    right = normalise(side)
+    columns = jnp.stack([right, jnp.cross(back, right), back, eye], axis=1)
+    return jnp.concatenate([columns, jnp.array([[0, 0, 0, 1]], columns.dtype)])
+
+
+def orbit(
+    center: ArrayLike, radius: ArrayLike, count: int, fov_y: ArrayLike, width: int, height: int, *, axis: ArrayLike = (0, 0, 1)
+) -> tuple[PerspectiveCamera, ...]:
+    """`count` cameras on a circle of `radius` around `center`, evenly spaced, `axis` pointing up in every picture."""
+    axis = normalise(float_array(axis, "axis", (3,)))
+    least = jax.nn.one_hot(jnp.argmin(jnp.abs(axis)), 3, dtype=axis.dtype)
+    first = normalise(jnp.cross(axis, least))
+    second = jnp.cross(axis, first)
+    angles = [2 * np.pi * i / count for i in range(count)]
+    offsets = [np.cos(angle) * first + np.sin(angle) * second for angle in angles]
+    return _around(center, radius, offsets, axis, fov_y, width, height)
+
+
+def fibonacci_sphere(
+    center: ArrayLike, radius: ArrayLike, count: int, fov_y: ArrayLike, width: int, height: int
+) -> tuple[PerspectiveCamera, ...]:
+    """`count` cameras spread evenly over a sphere of `radius` around `center` (golden-angle spiral), all looking inwards."""
+    offsets = []
+    for i in range(count):
+        z = 1 - (2 * i + 1) / count
+        angle = np.pi * (3 - np.sqrt(5)) * i
+        offsets.append(np.array([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z]))
+    return _around(center, radius, offsets, jnp.array([0.0, 0.0, 1.0]), fov_y, width, height)
+
+
+def _around(center: ArrayLike, radius: ArrayLike, offsets: list[Any], up: Array, fov_y: ArrayLike, width: int, height: int):
+    if not offsets:
+        raise ValueError("count must be at least 1")
+    center = float_array(center, "center", (3,))
+    cameras = []
+    for offset in offsets:
+        # At the poles of the sphere z cannot point up in the picture; y then does.
+        upward = jnp.where(jnp.abs(jnp.dot(jnp.asarray(offset), up)) > 0.999, jnp.roll(up, -1), up)
+        cameras.append(PerspectiveCamera.look_at(center + radius * jnp.asarray(offset), center, upward, fov_y, width, height))
+    return tuple(cameras)
+
+
+def _size(width: int, height: int) -> tuple[int, int]:
+    for name, size in (("width", width), ("height", height)):
+        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+            raise ValueError(f"{name} must be a positive whole number of pixels, not {size!r}")
+    return width, height
+
+
+def _plane(camera: AbstractCamera, pixels: Int[Array, "rays"], extent: Scalar) -> tuple[Float[Array, "rays"], Float[Array, "rays"]]:
+    """Position of pixel centres in an image plane whose full height is `extent`; y up, so row 0 is on top."""
+    row, column = jnp.divmod(pixels, camera.width)
+    scale = extent / camera.height
+    return (column + 0.5 - camera.width / 2) * scale, (camera.height / 2 - row - 0.5) * scale
+
+
+def _rotate(matrix: Affine, v: Triple) -> Triple:
+    return tuple(matrix[i, 0] * v[0] + matrix[i, 1] * v[1] + matrix[i, 2] * v[2] for i in range(3))

@@ -1,0 +1,47 @@
+"""Optical models: what one segment of a ray with constant properties adds (Max 1995; course notes on GPU-based volume
+ray-casting, Eurographics 2009, section 1.2.1)."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from jvr.model.transfer import Classified
+from jvr.types import Channels, Scalar
+
+
+class AbstractOpticalModel(eqx.Module):
+    """How emission and extinction along a segment of length `dt` become radiance and optical depth."""
+
+    @abc.abstractmethod
+    def segment(self, medium: Classified, dt: Scalar) -> tuple[Channels, Channels]:
+        """Radiance that leaves the segment (three components, or none where nothing is emitted) and its optical depth (one or
+        three components, or none where nothing is absorbed)."""
+
+
+class EmissionAbsorption(AbstractOpticalModel):
+    """Emission and absorption, `j = sigma_t * rgb`: a segment emits `rgb (1 - exp(-dtau))`.
+
+    That is `j dt phi1(dtau)` with `phi1(d) = (1 - exp(-d)) / d`, written without the quotient: for an opaque segment the terms of
+    the quotient's derivative cancel and would leave no digit of `exp(-dtau)`.
+    """
+
+    def segment(self, medium: Classified, dt: Scalar) -> tuple[Channels, Channels]:
+        dtau = tuple(sigma * dt for sigma in medium.sigma_t)
+        opacity = tuple(-jnp.expm1(-d) for d in dtau)
+        return tuple(c * a for c, a in zip(medium.rgb, opacity * (3 // len(opacity)), strict=True)), dtau
+
+
+class EmissionOnly(AbstractOpticalModel):
+    """A glowing, transparent medium: `j = sigma_t * rgb`, `T = 1`."""
+
+    def segment(self, medium: Classified, dt: Scalar) -> tuple[Channels, Channels]:
+        sigma_t = medium.sigma_t * (3 // len(medium.sigma_t))
+        return tuple(c * sigma * dt for c, sigma in zip(medium.rgb, sigma_t, strict=True)), ()
+
+
+class AbsorptionOnly(AbstractOpticalModel):
+    """A cold medium that only attenuates what is behind it: `j = 0`."""
+
+    def segment(self, medium: Classified, dt: Scalar) -> tuple[Channels, Channels]:
+        return (), tuple(sigma * dt for sigma in medium.sigma_t)

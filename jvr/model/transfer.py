@@ -1,0 +1,171 @@
+"""Transfer functions: from the scalar `s` to colour and extinction."""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jvr.model.checks import float_array, require
+from jvr.types import Channels, Scalar, Triple
+
+
+class Classified(NamedTuple):
+    """What a transfer function makes of a scalar: source colour (linear RGB) and extinction (1 / world length),
+    the latter one component for grey media and three for coloured ones."""
+
+    rgb: Triple
+    sigma_t: Channels
+
+
+class AbstractTransfer(eqx.Module):
+    """A map from the scalar `s` (in the data's own units) to source colour and extinction."""
+
+    @abc.abstractmethod
+    def evaluate(self, s: Scalar) -> Classified:
+        """Colour and extinction at one scalar value; traceable and differentiable in `s` and in every array."""
+
+
+class AbstractTable(AbstractTransfer):
+    """A transfer function that interpolates the rows of a table linearly, colour and extinction separately."""
+
+    rgb: eqx.AbstractVar[Float[Array, "n 3"]]
+    sigma_t: eqx.AbstractVar[Float[Array, "..."]]
+
+    @abc.abstractmethod
+    def coordinate(self, s: Scalar) -> Scalar:
+        """Where `s` falls in the table, 0 ... n-1, clamped; entry `i` has weight `max(0, 1 - |coordinate - i|)`."""
+
+
+class LinearTransfer(AbstractTable):
+    """Piecewise linear between control points, constant beyond the first and the last.
+
+    **Arguments:** `positions`: `(n,)`, strictly increasing, in the data's units; `rgb`: `(n, 3)`, linear; `sigma_t`: `(n,)`, or
+    `(n, 3)` for coloured extinction, per world length, not negative. All differentiable, positions too.
+    **Raises** `ValueError` for other shapes, positions that do not increase, negative or non-finite values.
+    """
+
+    positions: Float[Array, "n"]
+    rgb: Float[Array, "n 3"]
+    sigma_t: Float[Array, "..."]
+
+    def __init__(self, positions: ArrayLike, rgb: ArrayLike, sigma_t: ArrayLike):
+        self.positions = float_array(positions, "positions", (None,))
+        require(self.positions, np.isfinite, "positions must be finite")
+        n = self.positions.shape[0]
+        if n < 2:
+            raise ValueError(f"a transfer function needs at least 2 positions, not {n}")
+        require(jnp.diff(self.positions), lambda d: d > 0, "positions must be strictly increasing: sort them and remove duplicates")
+        self.rgb, self.sigma_t = _colour(rgb, n), _extinction(sigma_t, n)
+
+    def coordinate(self, s: Scalar) -> Scalar:
+        n = self.positions.shape[0]
+        above = jnp.searchsorted(self.positions, s, side="right", method="scan_unrolled")
+        i = jnp.clip(above - 1, 0, n - 2)
+        low, high = self.positions[i], self.positions[i + 1]
+        # Clamped before the division: far outside of a narrow interval the quotient would overflow.
+        fraction = (jnp.clip(s, low, high) - low) / (high - low)
+        return i + fraction
+
+    def evaluate(self, s: Scalar) -> Classified:
+        return _interpolate(self, self.coordinate(s))
+
+
+class LutTransfer(AbstractTable):
+    """A table with equally spaced entries: entries 0 and n-1 sit at the ends of `domain`, values clamp outside of it.
+
+    **Arguments:** `rgb`: `(n, 3)`; `sigma_t`: `(n,)` or `(n, 3)`; `domain`: `(low, high)` in the data's units. All differentiable.
+    **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
+    """
+
+    rgb: Float[Array, "n 3"]
+    sigma_t: Float[Array, "..."]
+    domain: Float[Array, "2"]
+
+    def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike):
+        rgb = float_array(rgb, "rgb", (None, 3))
+        if rgb.shape[0] < 2:
+            raise ValueError(f"a transfer function needs at least 2 entries, not {rgb.shape[0]}")
+        self.rgb, self.sigma_t = _colour(rgb, rgb.shape[0]), _extinction(sigma_t, rgb.shape[0])
+        self.domain = float_array(domain, "domain", (2,))
+        require(self.domain, lambda d: np.isfinite(d) & (d[0] < d[1]), "domain must be (low, high) with low < high")
+
+    @property
+    def positions(self) -> Float[Array, "n"]:
+        """Scalar value of each entry."""
+        return jnp.linspace(self.domain[0], self.domain[1], self.rgb.shape[0])
+
+    def coordinate(self, s: Scalar) -> Scalar:
+        last = self.rgb.shape[0] - 1
+        low, high = self.domain[0], self.domain[1]
+        return jnp.clip((s - low) * (last / (high - low)), 0, last)
+
+    def evaluate(self, s: Scalar) -> Classified:
+        return _interpolate(self, self.coordinate(s))
+
+
+class GaussianTransfer(AbstractTransfer):
+    """A sum of Gaussians: `sigma_t(s) = sum_g height_g exp(-(s - center_g)^2 / (2 width_g^2))`, and as colour the mean of the
+    Gaussians' colours, each weighted by its (mean) extinction. The weights are a softmax, so the colour stays defined where
+    every Gaussian underflows.
+
+    **Arguments:** `center`, `width`: `(g,)` in the data's units, widths positive; `height`: `(g,)` or `(g, 3)`, per world length;
+    `rgb`: `(g, 3)`. All differentiable. **Raises** `ValueError` for other shapes, widths not positive, negative heights.
+    """
+
+    center: Float[Array, "g"]
+    width: Float[Array, "g"]
+    height: Float[Array, "..."]
+    rgb: Float[Array, "g 3"]
+
+    def __init__(self, center: ArrayLike, width: ArrayLike, height: ArrayLike, rgb: ArrayLike):
+        self.center = float_array(center, "center", (None,))
+        g = self.center.shape[0]
+        if g < 1:
+            raise ValueError("GaussianTransfer needs at least one Gaussian")
+        self.width = float_array(width, "width", (g,))
+        require(self.center, np.isfinite, "center must be finite")
+        require(self.width, lambda w: np.isfinite(w) & (w > 0), "width must be positive")
+        self.height, self.rgb = _extinction(height, g, "height"), _colour(rgb, g)
+
+    def evaluate(self, s: Scalar) -> Classified:
+        exponent = -0.5 * jnp.square((s - self.center) / self.width)
+        sigma_t = tuple(jnp.sum(channel * jnp.exp(exponent)) for channel in _columns(self.height))
+        mean_height = self.height if self.height.ndim == 1 else jnp.mean(self.height, axis=1)
+        # A Gaussian of height zero has no say in the colour; its logarithm would have an infinite derivative.
+        absent = mean_height <= 0
+        log_weight = jnp.where(absent, -jnp.inf, jnp.log(jnp.where(absent, 1.0, mean_height)) + exponent)
+        weight = jax.nn.softmax(jnp.where(jnp.all(absent), exponent, log_weight))
+        return Classified(_three(self.rgb.T @ weight), sigma_t)
+
+
+def _colour(rgb: ArrayLike, n: int) -> Float[Array, "n 3"]:
+    rgb = float_array(rgb, "rgb", (n, 3))
+    require(rgb, np.isfinite, "rgb must be finite")
+    return rgb
+
+
+def _extinction(sigma_t: ArrayLike, n: int, name: str = "sigma_t") -> Float[Array, "..."]:
+    sigma_t = float_array(sigma_t, name, (n,), (n, 3))
+    require(sigma_t, lambda v: np.isfinite(v) & (v >= 0), f"{name} must be finite and not negative")
+    return sigma_t
+
+
+def _columns(table: Float[Array, "..."]) -> tuple[Float[Array, "n"], ...]:
+    return (table,) if table.ndim == 1 else tuple(table[:, c] for c in range(table.shape[1]))
+
+
+def _three(v: Float[Array, "3"]) -> Triple:
+    return v[0], v[1], v[2]
+
+
+def _interpolate(table: AbstractTable, u: Scalar) -> Classified:
+    low = jnp.clip(jnp.floor(u), 0, table.rgb.shape[0] - 2)
+    i, fraction = low.astype(jnp.int32), u - low
+    # The weighted sum, not a + f (b - a): at an end of an interval it returns the entry exactly.
+    read = lambda column: (1 - fraction) * column[i] + fraction * column[i + 1]
+    r, g, b = (read(column) for column in _columns(table.rgb))
+    return Classified((r, g, b), tuple(read(column) for column in _columns(table.sigma_t)))

@@ -1,0 +1,31 @@
+"""Shapes and types that the annotations of `jvr` claim are checked at run time in every test."""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "false")
+
+from jaxtyping import install_import_hook
+
+_hook = install_import_hook("jvr", "beartype.beartype")
+_hook.__enter__()
+
+import jax
+import pytest
+
+DATA = Path(os.environ.get("JVR_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+@pytest.fixture
+def x64():
+    """Double precision for one test."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def data() -> Path:
+    """The folder of public volumes; a test that needs it is skipped, with the reason, where it is absent."""
+    if not DATA.is_dir():
+        pytest.skip(f"needs the public volumes, not found in {DATA}: set JVR_DATA to their folder")
+    return DATA
