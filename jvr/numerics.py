@@ -35,9 +35,7 @@ def normalise(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     return jnp.where(is_zero, 0.0, scaled / jnp.linalg.norm(scaled, axis=-1, keepdims=True))
 
 
-def ray_box(
-    origin: Triple, direction: Triple, lower: Triple, upper: Triple
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+def ray_box(origin: Triple, direction: Triple, lower: Triple, upper: Triple) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Distances at which a ray enters and leaves an axis-aligned box (slab method, Kay and Kajiya 1986).
 
     The ray misses where `t_far <= t_near`. A ray parallel to a slab is inside it always or never: there the quotient

@@ -42,7 +42,11 @@ class PerspectiveCamera(AbstractCamera):
     def __init__(self, world_from_camera: ArrayLike, fov_y: ArrayLike, width: int, height: int):
         self.world_from_camera = affine(world_from_camera, "world_from_camera")
         self.fov_y = float_array(fov_y, "fov_y", ())
-        require(self.fov_y, lambda f: (f > 0) & (f < 180), "fov_y is the full vertical angle in degrees and must lie between 0 and 180")
+        require(
+            self.fov_y,
+            lambda f: (f > 0) & (f < 180),
+            "fov_y is the full vertical angle in degrees and must lie between 0 and 180",
+        )
         self.width, self.height = _size(width, height)
 
     @classmethod
@@ -101,7 +105,9 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Affine:
     back = normalise(eye - target)
     side = jnp.cross(normalise(up), back)
     require(back, lambda b: np.any(b != 0), "look_at needs an eye apart from its target")
-    require(side, lambda r: np.linalg.norm(r) > 1e-6, "look_at needs an up vector that is not parallel to the view: choose another up")
+    require(
+        side, lambda r: np.linalg.norm(r) > 1e-6, "look_at needs an up vector that is not parallel to the view: choose another up"
+    )
     right = normalise(side)
     columns = jnp.stack([right, jnp.cross(back, right), back, eye], axis=1)
     return jnp.concatenate([columns, jnp.array([[0, 0, 0, 1]], columns.dtype)])
@@ -151,7 +157,9 @@ def _size(width: int, height: int) -> tuple[int, int]:
     return width, height
 
 
-def _plane(camera: AbstractCamera, pixels: Int[Array, "rays"], extent: Scalar) -> tuple[Float[Array, "rays"], Float[Array, "rays"]]:
+def _plane(
+    camera: AbstractCamera, pixels: Int[Array, "rays"], extent: Scalar
+) -> tuple[Float[Array, "rays"], Float[Array, "rays"]]:
     """Position of pixel centres in an image plane whose full height is `extent`; y up, so row 0 is on top."""
     row, column = jnp.divmod(pixels, camera.width)
     scale = extent / camera.height

@@ -23,7 +23,9 @@ def window_level(window: float, level: float, *, sigma_t: float = 0.05, rgb: Arr
 
 def ct_bone() -> LinearTransfer:
     """Bone in ivory, everything softer transparent; HU, per millimetre."""
-    return _points([(150, 0.55, 0.25, 0.15, 0.0), (300, 0.85, 0.65, 0.45, 0.05), (700, 1.0, 0.93, 0.82, 0.4), (1500, 1.0, 1.0, 1.0, 0.8)])
+    return _points(
+        [(150, 0.55, 0.25, 0.15, 0.0), (300, 0.85, 0.65, 0.45, 0.05), (700, 1.0, 0.93, 0.82, 0.4), (1500, 1.0, 1.0, 1.0, 0.8)]
+    )
 
 
 def ct_soft_tissue() -> LinearTransfer:

@@ -58,7 +58,9 @@ class LinearTransfer(AbstractTable):
         n = self.positions.shape[0]
         if n < 2:
             raise ValueError(f"a transfer function needs at least 2 positions, not {n}")
-        require(jnp.diff(self.positions), lambda d: d > 0, "positions must be strictly increasing: sort them and remove duplicates")
+        require(
+            jnp.diff(self.positions), lambda d: d > 0, "positions must be strictly increasing: sort them and remove duplicates"
+        )
         self.rgb, self.sigma_t = _colour(rgb, n), _extinction(sigma_t, n)
 
     def coordinate(self, s: Scalar) -> Scalar:

@@ -88,7 +88,9 @@ class Volume(eqx.Module):
         if values.ndim != 3 or values.size == 0:
             raise ValueError(f"a volume needs three non-empty axes (x, y, z); its voxels have shape {values.shape}")
         if values.size >= 2**31:
-            raise ValueError(f"{values.shape} is {values.size:,} voxels; volumes of 2^31 voxels and more do not fit 32-bit indices: crop or coarsen")
+            raise ValueError(
+                f"{values.shape} is {values.size:,} voxels; volumes of 2^31 voxels and more do not fit 32-bit indices: crop or coarsen"
+            )
         if not (jnp.issubdtype(values.dtype, jnp.floating) or jnp.issubdtype(values.dtype, jnp.integer)):
             raise TypeError(f"voxels must be real or integer numbers, not {values.dtype}")
         self.values = values
@@ -127,10 +129,13 @@ class Volume(eqx.Module):
 
     def sample(self, p: Triple) -> Scalar:
         """The scalar `s` at one grid position `p`; positions outside of the domain are the caller's to exclude."""
+        return self.slope * self.interpolate(p) + self.intercept
+
+    def interpolate(self, p: Triple) -> Scalar:
+        """The stored voxels interpolated at one grid position, before slope and intercept."""
         indices, weights = self.interpolation.stencil(self.shape, p)
         voxels = self.values.reshape(-1)
-        value = sum(w * voxels.at[i].get(mode="promise_in_bounds").astype(w.dtype) for i, w in zip(indices, weights, strict=True))
-        return self.slope * value + self.intercept
+        return sum(w * voxels.at[i].get(mode="promise_in_bounds").astype(w.dtype) for i, w in zip(indices, weights, strict=True))
 
     def grid_from_world(self, x: Triple, *, direction: bool = False) -> Triple:
         """Grid position of a world position, or with `direction=True` grid displacement of a world displacement.

@@ -1,0 +1,1 @@
+"""How one ray becomes radiance, for a whole batch of rays at a time."""

@@ -1,0 +1,124 @@
+"""Which way a march is differentiated: the choices that `Settings(adjoint=...)` takes."""
+
+import abc
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jvr.march.adjoint import Inputs, is_there, replay_march
+from jvr.march.march import Marched, MarchOptions, Medium, march
+from jvr.march.rows import TableRows, table_rows
+from jvr.march.steps import Rays
+from jvr.march.table import split_entries
+from jvr.types import Scalar
+
+
+class AbstractAdjoint(eqx.Module):
+    """A way to differentiate a march."""
+
+    @abc.abstractmethod
+    def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
+        """The march, with this way's derivatives."""
+
+
+class Replay(AbstractAdjoint):
+    """Reverse mode by replay, for any number of unknowns: memory does not grow with the number of steps. The default.
+
+    JAX refuses forward mode (`jvp`, `jacfwd`) through it: use `Forward()`, or `Rows()` for few unknowns.
+    """
+
+    def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
+        return replay_march(options, medium, rays, dt)
+
+
+class Forward(AbstractAdjoint):
+    """Forward mode (`jvp`, `jacfwd`), for one or few directions. JAX refuses reverse mode through it: use `Replay()`."""
+
+    def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
+        return march(options, medium, rays, dt)
+
+
+class Rows(AbstractAdjoint):
+    """Forward and reverse mode and any nesting with `vmap`, for few unknowns.
+
+    The derivative of each ray with respect to every perturbed array is computed once and held, `rays x unknowns` numbers; a
+    tangent is that matrix times a direction. Entries of a table come out of one replay, with hat functions, at about the cost of a
+    gradient; other arrays by one reverse pass for each ray and output.
+    """
+
+    def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
+        return _rows_march(options, medium, rays, dt)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _rows_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
+    return march(options, medium, rays, dt)
+
+
+def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[Marched, Marched]:
+    is_zero = lambda t: isinstance(t, jax.custom_derivatives.SymbolicZero)
+    perturbed = jax.tree.map(lambda t, x: not is_zero(t) and eqx.is_inexact_array(x), tangents, primals, is_leaf=is_zero)
+    tangents = eqx.filter(tangents, perturbed)
+    medium, rays, dt = primals
+    rest_of_transfer, entries = split_entries(tangents[0].transfer)
+    if options.distance or not jax.tree.leaves(entries):
+        primal, tangent = march(options, *primals), None
+    else:
+        primal, rows = table_rows(options, medium, rays, dt)
+        tangents = (tangents[0]._replace(transfer=rest_of_transfer), *tangents[1:])
+        tangent = _times_entries(rows, entries)
+    if jax.tree.leaves(tangents):
+        rest = _times_rays(options, primals, tangents)
+        tangent = rest if tangent is None else jax.tree.map(jnp.add, tangent, rest)
+    elif tangent is None:
+        tangent = jax.tree.map(jnp.zeros_like, primal._replace(steps=None))
+    steps = jax.custom_derivatives.zero_from_primal(primal.steps, symbolic_zeros=True)
+    return primal, tangent._replace(steps=steps)
+
+
+_rows_march.defjvp(_rows_rule, symbolic_zeros=True)
+
+
+def _times_entries(rows: TableRows, tangent: Any) -> Marched:
+    """Rows of a table times a direction in its entries."""
+    rgb, sigma_t = tangent.rgb, tangent.sigma_t
+    sigma_column = lambda c: sigma_t if sigma_t.ndim == 1 else sigma_t[:, c]
+    radiance = [jnp.zeros(r.shape[0], r.dtype) for r in rows.radiance_rgb]
+    tau = [jnp.zeros(r.shape[0], r.dtype) for r in rows.tau_sigma]
+    for c in range(len(radiance)):
+        if rgb is not None:
+            radiance[c] += rows.radiance_rgb[c] @ rgb[:, c]
+        if sigma_t is not None:
+            radiance[c] += rows.radiance_sigma[c] @ sigma_column(c)
+    for c in range(len(tau)):
+        if sigma_t is not None:
+            tau[c] += rows.tau_sigma[c] @ sigma_column(c)
+    return Marched(tuple(radiance), tuple(tau), (), None)
+
+
+def _times_rays(options: MarchOptions, primals: Inputs, tangents: Any) -> Marched:
+    """The Jacobian of each ray with respect to the leaves of `tangents` that are not `None`, times `tangents`."""
+    medium, rays, dt = primals
+    shared, fixed = eqx.partition((medium, dt), is_there((tangents[0], tangents[2])))
+    own, fixed_own = eqx.partition(rays, is_there(tangents[1]))
+
+    def one(shared: Any, own: Any, fixed_own: Any):
+        medium, dt = eqx.combine(shared, fixed)
+        ray = jax.tree.map(lambda x: x[None], eqx.combine(own, fixed_own))
+        return jax.tree.map(lambda x: x[0], replay_march(options, medium, ray, dt)._replace(steps=None))
+
+    jacobian = jax.vmap(jax.jacrev(one, argnums=(0, 1)), in_axes=(None, 0, 0))(shared, own, fixed_own)
+
+    def times(of_output: Any):
+        by_shared, by_own = of_output
+        moved = (tangents[0], tangents[2])
+        terms = [
+            jnp.tensordot(j, t, axes=t.ndim) for j, t in zip(jax.tree.leaves(by_shared), jax.tree.leaves(moved), strict=True)
+        ]
+        terms += [j * t for j, t in zip(jax.tree.leaves(by_own), jax.tree.leaves(tangents[1]), strict=True)]
+        return sum(terms)
+
+    return jax.tree.map(times, jacobian, is_leaf=lambda x: isinstance(x, tuple) and len(x) == 2 and isinstance(x[1], Rays))

@@ -1,0 +1,35 @@
+"""The fields that rays can march through: voxels, resampled at every point, or samples kept from an earlier march."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jvr.march.march import AbstractField
+from jvr.march.steps import Point
+from jvr.model.volume import Volume
+from jvr.types import Scalar
+
+
+class VoxelField(AbstractField):
+    """The voxels of a volume, interpolated between."""
+
+    volume: Volume
+
+    def resample(self, point: Point) -> Scalar:
+        return self.volume.sample(point.p)
+
+    def deposit(self, gradient: "VoxelField", points: Point, cotangent: Float[Array, "rays"]) -> "VoxelField":
+        volume, total = self.volume, gradient.volume
+        if total.values is not None:
+            indices, weights = jax.vmap(lambda p: volume.interpolation.stencil(volume.shape, p))(points.p)
+            flat = total.values.reshape(-1)
+            for i, w in zip(indices, weights, strict=True):
+                flat = flat.at[i].add((w * cotangent * volume.slope).astype(flat.dtype), mode="promise_in_bounds")
+            total = eqx.tree_at(lambda v: v.values, total, flat.reshape(volume.shape))
+        if total.slope is not None:
+            stored = jax.vmap(volume.interpolate)(points.p)
+            total = eqx.tree_at(lambda v: v.slope, total, total.slope + jnp.sum(stored * cotangent))
+        if total.intercept is not None:
+            total = eqx.tree_at(lambda v: v.intercept, total, total.intercept + jnp.sum(cotangent))
+        return VoxelField(total)

@@ -1,0 +1,199 @@
+"""THE loop: a batch of rays, front to back, one segment of every ray at a time.
+
+The loop knows no effect by name. It is handed a `Medium`: a field that is resampled at a point and a shader that turns what was
+resampled into emitted radiance and optical depth.
+"""
+
+import abc
+import dataclasses
+import functools
+import math
+from typing import NamedTuple, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jvr.march.batch import shrinking_while
+from jvr.march.steps import Point, Rays, segment, segment_count
+from jvr.model.transfer import AbstractTransfer, Classified
+from jvr.numerics import two_sum
+from jvr.types import Channels, Scalar
+
+
+class AbstractField(eqx.Module):
+    """What is resampled along rays, the scalar `s`; its arrays may be large."""
+
+    @abc.abstractmethod
+    def resample(self, point: Point) -> Scalar:
+        """The scalar at one point, in the data's units."""
+
+    @abc.abstractmethod
+    def deposit(self, gradient: Self, points: Point, cotangent: Float[Array, "rays"]) -> Self:
+        """Adds the derivative of `sum(cotangent * resample(points))` to `gradient`, in place where the compiler can; leaves of
+        `gradient` that are `None` are not asked for."""
+
+
+class AbstractShader(eqx.Module):
+    """What a classified sample looks like: everything between the transfer function and the eye. Its arrays are small."""
+
+    @abc.abstractmethod
+    def segment(self, medium: Classified, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        """Emitted radiance (three components or none) and optical depth (one, three or none) of one segment of length `dt`."""
+
+
+class Medium(NamedTuple):
+    """What rays march through: resampled, classified, shaded."""
+
+    field: AbstractField
+    transfer: AbstractTransfer
+    shader: AbstractShader
+
+
+@dataclasses.dataclass(frozen=True)
+class MarchOptions:
+    """Static choices of a march. A ray ends once its transmittance, in every channel, is at most `termination`."""
+
+    termination: float
+    distance: bool
+
+
+class Marched(NamedTuple):
+    """What the loop returns for each ray.
+
+    `radiance`: three components, or none where nothing is emitted; `tau`: optical depth, one or three components, or none;
+    `distance`: opacity-weighted distance from the entry, not yet divided by the opacity, a component for each of `tau`, or none;
+    `steps`: segments taken.
+    """
+
+    radiance: Channels
+    tau: Channels
+    distance: Channels
+    steps: Int[Array, "rays"]
+
+
+class Sums(NamedTuple):
+    """The running state of a ray; radiance and optical depth as unevaluated sums of two floats (see `two_sum`)."""
+
+    radiance: Channels
+    radiance_low: Channels
+    tau: Channels
+    tau_low: Channels
+    distance: Channels
+
+
+class Lanes(NamedTuple):
+    """A ray while it marches: its index in the whole batch, its number of segments, its sums and the segments it took."""
+
+    rays: Rays
+    ray: Int[Array, "rays"]
+    count: Int[Array, "rays"]
+    sums: Sums
+    steps: Int[Array, "rays"]
+
+
+def march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
+    """Integrates emission and absorption along every ray (course notes on GPU-based volume ray-casting, Eurographics 2009, eq. 1.8).
+
+    Differentiable in forward mode as it stands; `jvr.march.adjoint` adds reverse mode. Detached: the number of segments and
+    the decision to end a ray early.
+    """
+    return marched(*integrate(options, medium, rays, dt))
+
+
+def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> tuple[Sums, Int[Array, "rays"]]:
+    """The final sums of every ray and the number of segments it took."""
+    emits, absorbs = channel_counts(medium, rays, dt)
+    zero = jnp.zeros_like(rays.length)
+    sums = Sums((zero,) * emits, (zero,) * emits, (zero,) * absorbs, (zero,) * absorbs, (zero,) * absorbs * options.distance)
+    count = segment_count(rays.length, dt)
+    lanes = Lanes(rays, jnp.arange(zero.size, dtype=jnp.int32), count, sums, jnp.zeros_like(count))
+
+    def advance(lanes: Lanes, k: Int[Array, ""]) -> tuple[Lanes, Int[Array, ""]]:
+        alive = is_alive(options, lanes, k)
+        emitted, dtau, u = take_segment(medium, lanes, dt, k, jnp.where(alive, lanes.count, 0))
+        return lanes._replace(sums=add_segment(lanes.sums, emitted, dtau, u), steps=lanes.steps + alive), k + 1
+
+    lanes, _ = shrinking_while(functools.partial(is_alive, options), advance, lanes, jnp.int32(0))
+    return lanes.sums, lanes.steps
+
+
+def marched(sums: Sums, steps: Int[Array, "rays"]) -> Marched:
+    """The sums rounded to one float each."""
+    return Marched(join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), sums.distance, steps)
+
+
+def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, ""], count: Int[Array, "rays"]):
+    """Emission and optical depth of segment `k` of every ray, and the distance of its midpoint; zero beyond `count`."""
+    extent, u = segment(k, count, lanes.rays.length, dt)
+    points = points_at(lanes.rays, lanes.ray, k, u)
+    classified = jax.vmap(medium.transfer.evaluate)(jax.vmap(medium.field.resample)(points))
+    emitted, dtau = jax.vmap(medium.shader.segment)(classified, points, extent)
+    return emitted, dtau, u
+
+
+def points_at(rays: Rays, ray: Int[Array, "rays"], k: Int[Array, ""], u: Float[Array, "rays"]) -> Point:
+    """The batch of points at distance `u` from the entry."""
+    p = tuple(e + u * d for e, d in zip(rays.entry, rays.direction, strict=True))
+    return Point(p, ray, jnp.broadcast_to(k, u.shape))
+
+
+def add_segment(sums: Sums, emitted: Channels, dtau: Channels, u: Float[Array, "rays"]) -> Sums:
+    """One step of front-to-back compositing."""
+    before = transmittance(sums)
+    radiance = add(sums.radiance, sums.radiance_low, through(before, emitted))
+    tau = add(sums.tau, sums.tau_low, dtau)
+    # `zip` of an empty tuple is empty: where the distance is not asked for it is not computed.
+    distance = tuple(sum_ + a * u for sum_, a in zip(sums.distance, opacity(before, dtau), strict=False))
+    return Sums(*radiance, *tau, distance)
+
+
+def transmittance(sums: Sums) -> Channels:
+    """Transmittance so far, from the optical depth and not as a running product, whose rounding errors would add up."""
+    return tuple(jnp.exp(-tau) for tau in join(sums.tau, sums.tau_low))
+
+
+def through(transmittances: Channels, emitted: Channels) -> Channels:
+    """What remains of each channel of `emitted`; a single transmittance serves all channels, none attenuates nothing."""
+    if not transmittances:
+        return emitted
+    return tuple(T * e for T, e in zip(spread(transmittances, len(emitted)), emitted, strict=True))
+
+
+def spread(channels: Channels, n: int) -> Channels:
+    """One component repeated for `n` channels, or the `n` components themselves."""
+    return channels * (n // len(channels)) if channels else channels
+
+
+def opacity(before: Channels, dtau: Channels) -> Channels:
+    """What one segment adds to the opacity of its ray, in each channel of `dtau`."""
+    return tuple(T * -jnp.expm1(-d) for T, d in zip(before, dtau, strict=True))
+
+
+def is_alive(options: MarchOptions, lanes: Lanes, k: Int[Array, ""]) -> Bool[Array, "rays"]:
+    """Whether segment `k` of each ray is still to be taken."""
+    alive = k < lanes.count
+    if options.termination > 0 and lanes.sums.tau:
+        thinnest = functools.reduce(jnp.minimum, lanes.sums.tau)
+        alive &= thinnest < -math.log(options.termination)
+    return alive
+
+
+def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:
+    """How many channels the medium emits and absorbs in, by shape alone."""
+    point = Point(tuple(x[0] for x in rays.entry), jnp.int32(0), jnp.int32(0))
+    classified = jax.eval_shape(medium.transfer.evaluate, dt)
+    emitted, dtau = jax.eval_shape(medium.shader.segment, classified, point, dt)
+    return len(emitted), len(dtau)
+
+
+def add(high: Channels, low: Channels, terms: Channels) -> tuple[Channels, Channels]:
+    """`two_sum` in every channel."""
+    sums = [two_sum(h, l, t) for h, l, t in zip(high, low, terms, strict=True)]
+    return tuple(s[0] for s in sums), tuple(s[1] for s in sums)
+
+
+def join(high: Channels, low: Channels) -> Channels:
+    """Two-float sums rounded to one float."""
+    return tuple(h + l for h, l in zip(high, low, strict=True))

@@ -1,0 +1,51 @@
+"""Where samples lie along a ray.
+
+Segments of length `dt` tile the part of a ray that lies inside the medium, from its entry to its exit; the last one is
+shortened. Each is sampled at its own midpoint. Positions come from the segment's index, never by accumulation, and are measured
+from the entry point, so that a camera far away costs no digits inside the volume.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jvr.types import Scalar, Triple
+
+
+class Rays(NamedTuple):
+    """A batch of rays inside a medium, each component an array of shape `(rays,)`.
+
+    `entry` and `direction` are in grid coordinates, `direction` per world length; `length` is the world length from entry to exit,
+    0 where the ray misses.
+    """
+
+    entry: Triple
+    direction: Triple
+    length: Float[Array, "rays"]
+
+
+class Point(NamedTuple):
+    """One sample on one ray: its grid position, the ray's index in the batch and the index of its segment."""
+
+    p: Triple
+    ray: Int[Array, ""]
+    segment: Int[Array, ""]
+
+
+def segment_count(length: Float[Array, "rays"], dt: Scalar) -> Int[Array, "rays"]:
+    """Number of segments of each ray, `ceil(length / dt)`."""
+    return jnp.ceil(jax.lax.stop_gradient(length / dt)).astype(jnp.int32)
+
+
+def segment(k: Int[Array, ""], count: Int[Array, "rays"], length: Float[Array, "rays"], dt: Scalar):
+    """Length of segment `k` of each ray, and the distance of its midpoint from the entry.
+
+    Only the last segment's length depends on where the ray leaves. Past it the length is zero and the point stays at the exit,
+    so that a finished ray never reads outside of the medium.
+    """
+    start = k * dt
+    last = jnp.maximum(length - start, 0.0)
+    extent = jnp.where(k < count - 1, dt, jnp.where(k < count, last, 0.0))
+    return extent, jnp.where(k < count, start + extent / 2, length)

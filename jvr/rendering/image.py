@@ -1,0 +1,117 @@
+"""`jvr.render`: a scene seen by a camera."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jvr.march.fields import VoxelField
+from jvr.march.march import Marched, MarchOptions, Medium
+from jvr.march.steps import Rays
+from jvr.model.camera import AbstractCamera
+from jvr.model.scene import Scene
+from jvr.numerics import divide_or_zero, ray_box
+from jvr.rendering.plan import OpticalShader
+from jvr.rendering.settings import Settings
+from jvr.types import Image, Scalar, Triple
+
+
+class RenderStats(eqx.Module):
+    """What a rendering took: `steps`, segments marched for each pixel, `(height, width)`."""
+
+    steps: Int[Array, "height width"]
+
+
+class Rendering(eqx.Module):
+    """A picture, row 0 at the top.
+
+    - `rgb`: `(height, width, 3)`, linear radiance; includes `T * background` where the scene has one.
+    - `alpha`: `(height, width)`, opacity of the medium, `1 - mean(T)`.
+    - `depth`: `(height, width)`, `sum T (1 - exp(-dtau)) t / alpha`, distance from the eye along the ray; 0 where alpha is 0.
+    - `stats`: `RenderStats`.
+    """
+
+    rgb: Image
+    alpha: Float[Array, "height width"]
+    depth: Float[Array, "height width"]
+    stats: RenderStats
+
+
+def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()) -> Rendering:
+    """Renders `scene` as `camera` sees it, by emission and absorption along the ray of each pixel.
+
+    Differentiable in every floating-point array of `scene` and `camera`: transfer function, voxels, pose, background, and where rays
+    enter and leave the volume. Detached: the number of segments and early termination. `settings.adjoint` says in which mode.
+    Traceable; `jax.jit(jvr.render)` compiles once for each structure of the scene, size of the picture and settings. A camera
+    with non-finite numbers gives NaN pixels.
+    """
+    pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
+    if pixels.size <= settings.tile:
+        rgb, alpha, depth, steps = _render_pixels(scene, camera, settings, pixels)
+    else:
+        rgb, alpha, depth, steps = _render_tiles(scene, camera, settings, pixels)
+    shape = (camera.height, camera.width)
+    return Rendering(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape), RenderStats(steps.reshape(shape)))
+
+
+def trace(
+    scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], *, distance: bool = False
+) -> tuple[Marched, Rays, Float[Array, "rays"]]:
+    """Marches the rays of some pixels; returns what they gathered, the rays, and the distance from the eye to their entry."""
+    rays, t_in = camera_rays(scene, camera, pixels)
+    medium = Medium(VoxelField(scene.volume), scene.transfer, OpticalShader(scene.optical))
+    options = MarchOptions(settings.termination, distance)
+    return settings.adjoint.march(options, medium, rays, step_length(scene, settings)), rays, t_in
+
+
+def step_length(scene: Scene, settings: Settings) -> Scalar:
+    """World length of a segment."""
+    return settings.step * jnp.min(scene.volume.spacing)
+
+
+def camera_rays(scene: Scene, camera: AbstractCamera, pixels: Int[Array, "rays"]) -> tuple[Rays, Float[Array, "rays"]]:
+    """The rays of some pixels inside the volume (and its clipping box), and the distance from the eye to their entry."""
+    origin, direction = camera.rays(pixels)
+    start = scene.volume.grid_from_world(origin)
+    along = scene.volume.grid_from_world(direction, direction=True)
+    t_in, t_out = ray_box(start, along, *scene.volume.domain)
+    if scene.clipping is not None:
+        near, far = ray_box(origin, direction, tuple(scene.clipping.lower), tuple(scene.clipping.upper))
+        t_in, t_out = jnp.maximum(t_in, near), jnp.minimum(t_out, far)
+    t_in = jnp.maximum(t_in, 0.0)
+    hit = t_out > t_in
+    # A ray that misses gets harmless numbers before any arithmetic, so that its derivative is zero and not 0 * inf.
+    t_in, t_out = jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0)
+    keep = lambda v: tuple(jnp.where(hit, x, 0.0) for x in v)
+    start, along = keep(start), keep(along)
+    entry = tuple(s + t_in * d for s, d in zip(start, along, strict=True))
+    return Rays(entry, along, t_out - t_in), t_in
+
+
+def composite(scene: Scene, gathered: Marched) -> tuple[Triple, Float[Array, "rays"]]:
+    """Colour of each ray with the background behind the medium, and the medium's opacity."""
+    transmittances = tuple(jnp.exp(-tau) for tau in gathered.tau)
+    zero = jnp.zeros(gathered.steps.shape, jnp.result_type(float))
+    rgb = gathered.radiance or (zero, zero, zero)
+    if scene.background is not None:
+        clear = transmittances * (3 // len(transmittances)) if transmittances else (1.0, 1.0, 1.0)
+        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, scene.background, strict=True))
+    # expm1 and not 1 - T: thin media keep their digits.
+    alpha = sum((-jnp.expm1(-tau) for tau in gathered.tau), zero) / max(len(gathered.tau), 1)
+    return rgb, alpha
+
+
+def _render_pixels(scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"]):
+    gathered, _, t_in = trace(scene, camera, settings, pixels, distance=True)
+    rgb, alpha = composite(scene, gathered)
+    weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
+    depth = jnp.where(alpha > 0, t_in + divide_or_zero(weighted, alpha), 0.0)
+    return jnp.stack(rgb, axis=-1), alpha, depth, gathered.steps
+
+
+def _render_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"]):
+    count = -(-pixels.size // settings.tile)
+    # The last tile repeats the last pixel; what it computes for it is dropped.
+    padded = jnp.minimum(jnp.arange(count * settings.tile, dtype=jnp.int32), pixels.size - 1).reshape(count, settings.tile)
+    tiles = jax.lax.map(lambda tile: _render_pixels(scene, camera, settings, tile), padded)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: pixels.size], tiles)

@@ -1,0 +1,41 @@
+"""How a scene is rendered: everything that changes time and accuracy, and nothing that changes the scene."""
+
+import math
+
+import equinox as eqx
+
+from jvr.march.differentiation import AbstractAdjoint, Replay
+
+
+class Settings(eqx.Module):
+    """Static choices of a rendering; hashable, without arrays, so `jax.jit(jvr.render)` works as it is.
+
+    **Arguments:**
+
+    - `step`: length of a segment in units of the smallest voxel spacing; the error falls with its square in smooth scenes.
+    - `termination`: a ray ends once its transmittance is at most this, in every channel. What is behind could have added at most
+      `termination` times the brightest radiance. 0 follows every ray to its end.
+    - `adjoint`: how derivatives are computed: `jvr.Replay()` (reverse mode, default), `jvr.Forward()` or `jvr.Rows()`.
+    - `tile`: rays marched at a time. Memory in flight is about 300 bytes a ray; smaller tiles need less and take longer.
+
+    **Raises** `ValueError` for values out of range.
+    """
+
+    step: float = eqx.field(static=True)
+    termination: float = eqx.field(static=True)
+    adjoint: AbstractAdjoint
+    tile: int = eqx.field(static=True)
+
+    def __init__(self, step: float = 0.5, *, termination: float = 1e-4, adjoint: AbstractAdjoint = Replay(), tile: int = 262_144):
+        if isinstance(step, bool) or not isinstance(step, int | float) or not (math.isfinite(step) and step > 0):
+            raise ValueError(f"step must be a positive number of voxels, not {step!r}; 0.5 is a good start")
+        if not isinstance(termination, int | float) or not 0 <= termination < 1:
+            raise ValueError(f"termination must be a transmittance in [0, 1), not {termination!r}; 0 never ends a ray early")
+        if isinstance(tile, bool) or not isinstance(tile, int) or tile < 1:
+            raise ValueError(f"tile must be a positive number of rays, not {tile!r}")
+        if not isinstance(adjoint, AbstractAdjoint):
+            raise TypeError(f"adjoint must be jvr.Replay(), jvr.Forward() or jvr.Rows(), not {adjoint!r}")
+        self.step = float(step)
+        self.termination = float(termination)
+        self.adjoint = adjoint
+        self.tile = tile
