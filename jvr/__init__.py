@@ -1,5 +1,8 @@
 """A differentiable direct volume renderer in JAX."""
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from jvr.march.differentiation import Forward as Forward
 from jvr.march.differentiation import Replay as Replay
 from jvr.march.differentiation import Rows as Rows
@@ -22,5 +25,59 @@ from jvr.model.volume import Volume as Volume
 from jvr.rendering.image import Rendering as Rendering
 from jvr.rendering.image import RenderStats as RenderStats
 from jvr.rendering.image import render as render
+from jvr.rendering.plan import plan as plan
 from jvr.rendering.settings import Settings as Settings
 from jvr.types import Outcome as Outcome
+
+if TYPE_CHECKING:
+    from jvr.fitting.fit import FitResult as FitResult
+    from jvr.fitting.fit import fit as fit
+    from jvr.fitting.initialise import colours_given_extinction as colours_given_extinction
+    from jvr.fitting.initialise import flat_transfer as flat_transfer
+    from jvr.fitting.losses import DSSIM as DSSIM
+    from jvr.fitting.losses import AbsoluteError as AbsoluteError
+    from jvr.fitting.losses import ColourSmoothness as ColourSmoothness
+    from jvr.fitting.losses import ExtinctionSmoothness as ExtinctionSmoothness
+    from jvr.fitting.losses import Huber as Huber
+    from jvr.fitting.losses import Sparsity as Sparsity
+    from jvr.fitting.losses import SquaredError as SquaredError
+    from jvr.fitting.residuals import residuals as residuals
+    from jvr.fitting.solvers import LBFGSB as LBFGSB
+    from jvr.fitting.solvers import Dogleg as Dogleg
+    from jvr.fitting.solvers import GaussNewton as GaussNewton
+    from jvr.fitting.solvers import LevenbergMarquardt as LevenbergMarquardt
+    from jvr.fitting.unknowns import Identity as Identity
+    from jvr.fitting.unknowns import Ordered as Ordered
+    from jvr.fitting.unknowns import Sigmoid as Sigmoid
+    from jvr.fitting.unknowns import Softplus as Softplus
+    from jvr.io.volumes import read_volume as read_volume
+
+# Fitting alone takes longer to import than JAX, so it and the readers are imported by their first use.
+_LATE = {
+    "jvr.fitting.fit": ("FitResult", "fit"),
+    "jvr.fitting.initialise": ("colours_given_extinction", "flat_transfer"),
+    "jvr.fitting.losses": (
+        "DSSIM",
+        "AbsoluteError",
+        "ColourSmoothness",
+        "ExtinctionSmoothness",
+        "Huber",
+        "Sparsity",
+        "SquaredError",
+    ),
+    "jvr.fitting.residuals": ("residuals",),
+    "jvr.fitting.solvers": ("LBFGSB", "Dogleg", "GaussNewton", "LevenbergMarquardt"),
+    "jvr.fitting.unknowns": ("Identity", "Ordered", "Sigmoid", "Softplus"),
+    "jvr.io.volumes": ("read_volume",),
+}
+_MODULE_OF = {name: module for module, names in _LATE.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'jvr' has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_MODULE_OF])

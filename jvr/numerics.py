@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jvr.types import Triple
+from jvr.types import Corner, Triple
 
 
 def two_sum(
@@ -21,29 +21,63 @@ def two_sum(
     return total, low + jax.lax.stop_gradient(error)
 
 
+@jax.custom_jvp
 def divide_or_zero(numerator: Float[Array, "*n"], denominator: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """`numerator / denominator`, and 0 with derivative 0 where the denominator is 0."""
+    """`numerator / denominator`, and 0 where the denominator is 0.
+
+    The derivative is `(dn - q dd) / d`: nothing is squared, so that it survives denominators whose square underflows, and where
+    `q` is 1 it cancels exactly. It is 0 for denominators so small that it would overflow.
+    """
     is_zero = denominator == 0
     return jnp.where(is_zero, 0.0, numerator / jnp.where(is_zero, 1.0, denominator))
 
 
+@divide_or_zero.defjvp
+def _divide_or_zero_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (numerator, denominator), (dn, dd) = primals, tangents
+    quotient = divide_or_zero(numerator, denominator)
+    limits = jnp.finfo(denominator.dtype)
+    negligible = jnp.abs(denominator) < limits.tiny / limits.eps
+    inverse = jnp.where(negligible, 0.0, 1.0 / jnp.where(negligible, 1.0, denominator))
+    return quotient, (dn - quotient * dd) * inverse
+
+
+@jax.custom_jvp
+def one_minus_exp(tau: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """`1 - exp(-tau)`, the opacity of an optical depth, with every digit for thin media.
+
+    Its derivative `exp(-tau)` keeps every digit for opaque ones: JAX's own for `expm1` forms `(exp(-tau) - 1) + 1`, which in
+    float32 is 0 from `tau = 17`.
+    """
+    return -jnp.expm1(-tau)
+
+
+@one_minus_exp.defjvp
+def _one_minus_exp_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (tau,), (tangent,) = primals, tangents
+    return one_minus_exp(tau), jnp.exp(-tau) * tangent
+
+
 def normalise(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Unit vector; the zero vector stays zero, with derivative zero. Scaled first, so that squares neither overflow nor underflow."""
+    """Unit vector; zero stays zero, with derivative zero. Scaled first, so that squares neither overflow nor underflow."""
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1, keepdims=True))
     is_zero = scale == 0
     scaled = jnp.where(is_zero, 1.0, vector / jnp.where(is_zero, 1.0, scale))
     return jnp.where(is_zero, 0.0, scaled / jnp.linalg.norm(scaled, axis=-1, keepdims=True))
 
 
-def ray_box(origin: Triple, direction: Triple, lower: Triple, upper: Triple) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+def ray_box(origin: Triple, direction: Triple, lower: Corner, upper: Corner) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Distances at which a ray enters and leaves an axis-aligned box (slab method, Kay and Kajiya 1986).
 
     The ray misses where `t_far <= t_near`. A ray parallel to a slab is inside it always or never: there the quotient
-    is not formed, so neither value nor derivative is NaN. Differentiable in everything; the choice of the face is not.
+    is not formed, so neither value nor derivative is NaN. So is a ray parallel up to the square of the machine's precision, where
+    the derivative of the quotient would overflow. Differentiable in everything; the choice of the face is not.
     """
+    steepest = jnp.maximum(jnp.maximum(jnp.abs(direction[0]), jnp.abs(direction[1])), jnp.abs(direction[2]))
+    negligible = steepest * jnp.finfo(steepest.dtype).eps ** 2
     t_near, t_far = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
     for o, d, low, high in zip(origin, direction, lower, upper, strict=True):
-        parallel = d == 0
+        parallel = jnp.abs(d) <= negligible
         inverse = 1.0 / jnp.where(parallel, 1.0, d)
         first, second = (low - o) * inverse, (high - o) * inverse
         inside = (o >= low) & (o <= high)

@@ -17,9 +17,14 @@ XLA then keeps every component contiguous, which on CPUs is several times faster
 """
 
 import enum
-from typing import TypeAlias
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
+import jaxtyping
 from jaxtyping import Array, Float, Num
+
+# What constructors convert to an array: jaxtyping's own alias leaves out lists and tuples of numbers.
+ArrayLike: TypeAlias = jaxtyping.ArrayLike | Sequence[Any]
 
 Scalar: TypeAlias = Float[Array, ""]
 Vector: TypeAlias = Float[Array, "3"]
@@ -30,6 +35,8 @@ Image: TypeAlias = Float[Array, "height width 3"]
 # One component for each colour channel, or a single one that serves all three.
 Channels: TypeAlias = tuple[Float[Array, "..."], ...]
 Triple: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]
+# Corners of a box, known when the program is compiled or traced.
+Corner: TypeAlias = Triple | tuple[float, float, float]
 
 
 class Outcome(enum.Enum):

@@ -31,11 +31,10 @@ from jvr.march.march import (
     march,
     marched,
     opacity,
-    points_at,
     through,
     transmittance,
 )
-from jvr.march.steps import Rays, segment, segment_count
+from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.march.table import deposit_entries, split_entries
 from jvr.types import Channels, Scalar
 
@@ -85,7 +84,7 @@ class _Gradients(NamedTuple):
     k: Int[Array, ""]
 
 
-def replay(wanted: Inputs, fixed: Inputs, sums: Sums, steps: Int[Array, "rays"], cotangent: Marched) -> Inputs:
+def replay(wanted: Any, fixed: Any, sums: Sums, steps: Int[Array, "rays"], cotangent: Marched) -> Any:
     """The gradient of `<cotangent, march>` with respect to the leaves of `wanted` that are not `None`.
 
     **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `sums`, `steps`: what the forward march ended with.
@@ -150,8 +149,8 @@ def is_there(tree: Any) -> Any:
 def subtract_segment(remaining: Sums, emitted: Channels, opacities: Channels, u: Float[Array, "rays"]) -> Sums:
     """What is still to come after a segment."""
     radiance = add(remaining.radiance, remaining.radiance_low, tuple(-e for e in emitted))
-    distance = tuple(d - a * u for d, a in zip(remaining.distance, opacities, strict=False))
-    return Sums(*radiance, (), (), distance)
+    nearer = tuple(-a * u for a in opacities) if remaining.distance else ()
+    return Sums(*radiance, (), (), *add(remaining.distance, remaining.distance_low, nearer))
 
 
 def segment_cotangents(cotangent: Marched, remaining: Sums, before: Channels, dtau: Channels, u: Float[Array, "rays"]):
@@ -160,7 +159,7 @@ def segment_cotangents(cotangent: Marched, remaining: Sums, before: Channels, dt
     n = len(dtau)
     to_dtau = [sum(to_come[c::n], cotangent.tau[c]) for c in range(n)]
     to_u = jnp.zeros_like(u)
-    for c, g in enumerate(cotangent.distance):
-        to_dtau[c] += g * (u * before[c] * jnp.exp(-dtau[c]) - remaining.distance[c])
+    for c, (g, r) in enumerate(zip(cotangent.distance, join(remaining.distance, remaining.distance_low), strict=True)):
+        to_dtau[c] += g * (u * before[c] * jnp.exp(-dtau[c]) - r)
         to_u += g * opacity(before, dtau)[c]
     return through(before, cotangent.radiance), tuple(to_dtau), to_u

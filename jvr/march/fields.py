@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, UInt
 
 from jvr.march.march import AbstractField
 from jvr.march.steps import Point
@@ -33,3 +33,22 @@ class VoxelField(AbstractField):
         if total.intercept is not None:
             total = eqx.tree_at(lambda v: v.intercept, total, total.intercept + jnp.sum(cotangent))
         return VoxelField(total)
+
+
+class KeptField(AbstractField):
+    """Scalars kept from an earlier march along the same rays: sample `k` of a ray is `stored[start[ray] + k * stride]`, an integer
+    that stands for `low + scale * stored`. Positions play no part, and nothing here is differentiable."""
+
+    stored: UInt[Array, "samples"]
+    start: Int[Array, "rays"]
+    low: Scalar
+    scale: Scalar
+    stride: int = eqx.field(static=True)
+
+    def resample(self, point: Point) -> Scalar:
+        # Clipped: the index of a finished ray may lie beyond the end.
+        index = self.start[point.ray] + point.segment * self.stride
+        return self.low + self.scale * self.stored.at[index].get(mode="clip").astype(self.low.dtype)
+
+    def deposit(self, gradient: "KeptField", points: Point, cotangent: Float[Array, "rays"]) -> "KeptField":
+        return gradient

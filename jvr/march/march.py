@@ -8,7 +8,7 @@ import abc
 import dataclasses
 import functools
 import math
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.march.batch import shrinking_while
-from jvr.march.steps import Point, Rays, segment, segment_count
+from jvr.march.steps import Point, Rays, points_at, segment, segment_count
 from jvr.model.transfer import AbstractTransfer, Classified
-from jvr.numerics import two_sum
+from jvr.numerics import one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
 
@@ -30,7 +30,7 @@ class AbstractField(eqx.Module):
         """The scalar at one point, in the data's units."""
 
     @abc.abstractmethod
-    def deposit(self, gradient: Self, points: Point, cotangent: Float[Array, "rays"]) -> Self:
+    def deposit(self, gradient: "AbstractField", points: Point, cotangent: Float[Array, "rays"]) -> "AbstractField":
         """Adds the derivative of `sum(cotangent * resample(points))` to `gradient`, in place where the compiler can; leaves of
         `gradient` that are `None` are not asked for."""
 
@@ -74,13 +74,14 @@ class Marched(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """The running state of a ray; radiance and optical depth as unevaluated sums of two floats (see `two_sum`)."""
+    """The running state of a ray: radiance, optical depth and distance, each an unevaluated sum of two floats (see `two_sum`)."""
 
     radiance: Channels
     radiance_low: Channels
     tau: Channels
     tau_low: Channels
     distance: Channels
+    distance_low: Channels
 
 
 class Lanes(NamedTuple):
@@ -106,7 +107,8 @@ def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> 
     """The final sums of every ray and the number of segments it took."""
     emits, absorbs = channel_counts(medium, rays, dt)
     zero = jnp.zeros_like(rays.length)
-    sums = Sums((zero,) * emits, (zero,) * emits, (zero,) * absorbs, (zero,) * absorbs, (zero,) * absorbs * options.distance)
+    blank = lambda n: ((zero,) * n, (zero,) * n)
+    sums = Sums(*blank(emits), *blank(absorbs), *blank(absorbs * options.distance))
     count = segment_count(rays.length, dt)
     lanes = Lanes(rays, jnp.arange(zero.size, dtype=jnp.int32), count, sums, jnp.zeros_like(count))
 
@@ -121,7 +123,7 @@ def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> 
 
 def marched(sums: Sums, steps: Int[Array, "rays"]) -> Marched:
     """The sums rounded to one float each."""
-    return Marched(join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), sums.distance, steps)
+    return Marched(join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), join(sums.distance, sums.distance_low), steps)
 
 
 def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, ""], count: Int[Array, "rays"]):
@@ -133,20 +135,14 @@ def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, ""], co
     return emitted, dtau, u
 
 
-def points_at(rays: Rays, ray: Int[Array, "rays"], k: Int[Array, ""], u: Float[Array, "rays"]) -> Point:
-    """The batch of points at distance `u` from the entry."""
-    p = tuple(e + u * d for e, d in zip(rays.entry, rays.direction, strict=True))
-    return Point(p, ray, jnp.broadcast_to(k, u.shape))
-
-
 def add_segment(sums: Sums, emitted: Channels, dtau: Channels, u: Float[Array, "rays"]) -> Sums:
     """One step of front-to-back compositing."""
     before = transmittance(sums)
     radiance = add(sums.radiance, sums.radiance_low, through(before, emitted))
     tau = add(sums.tau, sums.tau_low, dtau)
-    # `zip` of an empty tuple is empty: where the distance is not asked for it is not computed.
-    distance = tuple(sum_ + a * u for sum_, a in zip(sums.distance, opacity(before, dtau), strict=False))
-    return Sums(*radiance, *tau, distance)
+    # Where the distance is not asked for it is not computed.
+    further = tuple(a * u for a in opacity(before, dtau)) if sums.distance else ()
+    return Sums(*radiance, *tau, *add(sums.distance, sums.distance_low, further))
 
 
 def transmittance(sums: Sums) -> Channels:
@@ -168,7 +164,7 @@ def spread(channels: Channels, n: int) -> Channels:
 
 def opacity(before: Channels, dtau: Channels) -> Channels:
     """What one segment adds to the opacity of its ray, in each channel of `dtau`."""
-    return tuple(T * -jnp.expm1(-d) for T, d in zip(before, dtau, strict=True))
+    return tuple(T * one_minus_exp(d) for T, d in zip(before, dtau, strict=True))
 
 
 def is_alive(options: MarchOptions, lanes: Lanes, k: Int[Array, ""]) -> Bool[Array, "rays"]:

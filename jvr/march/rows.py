@@ -24,11 +24,10 @@ from jvr.march.march import (
     integrate,
     marched,
     opacity,
-    points_at,
     through,
     transmittance,
 )
-from jvr.march.steps import Rays, segment, segment_count
+from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.types import Scalar
 
 # Segments whose contributions are added to the rows in one pass over memory: the rows are long, the segments short.
@@ -66,10 +65,10 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
         rays,
         jnp.arange(steps.size, dtype=jnp.int32),
         segment_count(rays.length, dt),
-        jax.tree.map(jnp.zeros_like, sums)._replace(distance=()),
+        jax.tree.map(jnp.zeros_like, sums)._replace(distance=(), distance_low=()),
         steps,
     )
-    remaining = sums._replace(tau=(), tau_low=(), distance=())
+    remaining = sums._replace(tau=(), tau_low=(), distance=(), distance_low=())
 
     def alive(state: _RowLanes, k: Int[Array, ""]):
         return k < state.lanes.steps

@@ -49,3 +49,9 @@ def segment(k: Int[Array, ""], count: Int[Array, "rays"], length: Float[Array, "
     last = jnp.maximum(length - start, 0.0)
     extent = jnp.where(k < count - 1, dt, jnp.where(k < count, last, 0.0))
     return extent, jnp.where(k < count, start + extent / 2, length)
+
+
+def points_at(rays: Rays, ray: Int[Array, "rays"], k: Int[Array, ""], u: Float[Array, "rays"]) -> Point:
+    """The batch of points at distance `u` from the entry."""
+    p = tuple(e + u * d for e, d in zip(rays.entry, rays.direction, strict=True))
+    return Point(p, ray, jnp.broadcast_to(k, u.shape))

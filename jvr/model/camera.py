@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jvr.model.checks import affine, float_array, require
 from jvr.numerics import normalise
-from jvr.types import Affine, Scalar, Triple
+from jvr.types import Affine, ArrayLike, Scalar, Triple
 
 
 class AbstractCamera(eqx.Module):

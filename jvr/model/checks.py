@@ -5,9 +5,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from jvr.types import Affine
+from jvr.types import Affine, ArrayLike
 
 
 def float_array(value: ArrayLike | Any, name: str, *shapes: tuple[int | None, ...]) -> Float[Array, "..."]:

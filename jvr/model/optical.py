@@ -4,9 +4,9 @@ ray-casting, Eurographics 2009, section 1.2.1)."""
 import abc
 
 import equinox as eqx
-import jax.numpy as jnp
 
 from jvr.model.transfer import Classified
+from jvr.numerics import one_minus_exp
 from jvr.types import Channels, Scalar
 
 
@@ -28,7 +28,7 @@ class EmissionAbsorption(AbstractOpticalModel):
 
     def segment(self, medium: Classified, dt: Scalar) -> tuple[Channels, Channels]:
         dtau = tuple(sigma * dt for sigma in medium.sigma_t)
-        opacity = tuple(-jnp.expm1(-d) for d in dtau)
+        opacity = tuple(one_minus_exp(d) for d in dtau)
         return tuple(c * a for c, a in zip(medium.rgb, opacity * (3 // len(opacity)), strict=True)), dtau
 
 

@@ -4,9 +4,9 @@ Extinctions are per millimetre, the unit of the world in every medical format.
 """
 
 import numpy as np
-from jaxtyping import ArrayLike
 
 from jvr.model.transfer import LinearTransfer
+from jvr.types import ArrayLike
 
 
 def window_level(window: float, level: float, *, sigma_t: float = 0.05, rgb: ArrayLike = (1.0, 1.0, 1.0)) -> LinearTransfer:

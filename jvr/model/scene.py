@@ -1,13 +1,12 @@
 """The scene: a volume and everything that says how it looks."""
 
 import equinox as eqx
-from jaxtyping import ArrayLike
 
 from jvr.model.checks import float_array
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import ClippingBox, Volume
-from jvr.types import Vector
+from jvr.types import ArrayLike, Vector
 
 
 class Scene(eqx.Module):

@@ -7,10 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from jvr.model.checks import float_array, require
-from jvr.types import Channels, Scalar, Triple
+from jvr.numerics import divide_or_zero
+from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 
 class Classified(NamedTuple):
@@ -79,8 +80,8 @@ class LinearTransfer(AbstractTable):
 class LutTransfer(AbstractTable):
     """A table with equally spaced entries: entries 0 and n-1 sit at the ends of `domain`, values clamp outside of it.
 
-    **Arguments:** `rgb`: `(n, 3)`; `sigma_t`: `(n,)` or `(n, 3)`; `domain`: `(low, high)` in the data's units. All differentiable.
-    **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
+    **Arguments:** `rgb`: `(n, 3)`; `sigma_t`: `(n,)` or `(n, 3)`; `domain`: `(low, high)` in the data's units. All
+    differentiable. **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
     """
 
     rgb: Float[Array, "n 3"]
@@ -112,7 +113,8 @@ class LutTransfer(AbstractTable):
 class GaussianTransfer(AbstractTransfer):
     """A sum of Gaussians: `sigma_t(s) = sum_g height_g exp(-(s - center_g)^2 / (2 width_g^2))`, and as colour the mean of the
     Gaussians' colours, each weighted by its (mean) extinction. The weights are a softmax, so the colour stays defined where
-    every Gaussian underflows.
+    every Gaussian underflows. Where all heights are zero the weights do not depend on them: then the derivative in a height has
+    the mean colour instead of its Gaussian's own.
 
     **Arguments:** `center`, `width`: `(g,)` in the data's units, widths positive; `height`: `(g,)` or `(g, 3)`, per world length;
     `rgb`: `(g, 3)`. All differentiable. **Raises** `ValueError` for other shapes, widths not positive, negative heights.
@@ -134,13 +136,18 @@ class GaussianTransfer(AbstractTransfer):
         self.height, self.rgb = _extinction(height, g, "height"), _colour(rgb, g)
 
     def evaluate(self, s: Scalar) -> Classified:
-        exponent = -0.5 * jnp.square((s - self.center) / self.width)
+        limit = jnp.finfo(self.center.dtype).max
+        # Squared below: farther out the square would overflow, and the colour of two overflows is undefined.
+        z = jnp.clip((s - self.center) / self.width, -0.5 * limit**0.5, 0.5 * limit**0.5)
+        exponent = -0.5 * jnp.square(z)
         sigma_t = tuple(jnp.sum(channel * jnp.exp(exponent)) for channel in _columns(self.height))
-        mean_height = self.height if self.height.ndim == 1 else jnp.mean(self.height, axis=1)
-        # A Gaussian of height zero has no say in the colour; its logarithm would have an infinite derivative.
-        absent = mean_height <= 0
-        log_weight = jnp.where(absent, -jnp.inf, jnp.log(jnp.where(absent, 1.0, mean_height)) + exponent)
-        weight = jax.nn.softmax(jnp.where(jnp.all(absent), exponent, log_weight))
+        # A softmax of log(height) + exponent, but linear in the height: the logarithm's derivative at zero is infinite.
+        height = self.height if self.height.ndim == 1 else jnp.mean(self.height, axis=1)
+        height = jnp.where(jnp.any(height > 0), height, 1.0)
+        log_height = jnp.log(jnp.where(height > 0, height, 1.0))
+        largest = jax.lax.stop_gradient(jnp.max(exponent + log_height, where=height > 0, initial=-limit))
+        weight = height * jnp.exp(jnp.minimum(exponent - largest, 0.9 * jnp.log(limit)))
+        weight = divide_or_zero(weight, jnp.broadcast_to(jnp.sum(weight), weight.shape))
         return Classified(_three(self.rgb.T @ weight), sigma_t)
 
 

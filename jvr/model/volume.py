@@ -5,10 +5,10 @@ import math
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jvr.model.checks import affine, float_array, require
-from jvr.types import Affine, Scalar, Triple, Vector, Voxels
+from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
 
 Stencil = tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, ""], ...]]
 
@@ -89,7 +89,7 @@ class Volume(eqx.Module):
             raise ValueError(f"a volume needs three non-empty axes (x, y, z); its voxels have shape {values.shape}")
         if values.size >= 2**31:
             raise ValueError(
-                f"{values.shape} is {values.size:,} voxels; volumes of 2^31 voxels and more do not fit 32-bit indices: crop or coarsen"
+                f"{values.shape} is {values.size:,} voxels; 2^31 voxels and more do not fit 32-bit indices: crop or coarsen"
             )
         if not (jnp.issubdtype(values.dtype, jnp.floating) or jnp.issubdtype(values.dtype, jnp.integer)):
             raise TypeError(f"voxels must be real or integer numbers, not {values.dtype}")

@@ -5,13 +5,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.fields import VoxelField
-from jvr.march.march import Marched, MarchOptions, Medium
+from jvr.march.march import Marched, MarchOptions
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.numerics import divide_or_zero, ray_box
-from jvr.rendering.plan import OpticalShader
+from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
+from jvr.rendering.plan import medium
 from jvr.rendering.settings import Settings
 from jvr.types import Image, Scalar, Triple
 
@@ -58,10 +57,9 @@ def trace(
     scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], *, distance: bool = False
 ) -> tuple[Marched, Rays, Float[Array, "rays"]]:
     """Marches the rays of some pixels; returns what they gathered, the rays, and the distance from the eye to their entry."""
-    rays, t_in = camera_rays(scene, camera, pixels)
-    medium = Medium(VoxelField(scene.volume), scene.transfer, OpticalShader(scene.optical))
+    rays, t_in = enter(scene, *camera.rays(pixels))
     options = MarchOptions(settings.termination, distance)
-    return settings.adjoint.march(options, medium, rays, step_length(scene, settings)), rays, t_in
+    return settings.adjoint.march(options, medium(scene), rays, step_length(scene, settings)), rays, t_in
 
 
 def step_length(scene: Scene, settings: Settings) -> Scalar:
@@ -69,9 +67,11 @@ def step_length(scene: Scene, settings: Settings) -> Scalar:
     return settings.step * jnp.min(scene.volume.spacing)
 
 
-def camera_rays(scene: Scene, camera: AbstractCamera, pixels: Int[Array, "rays"]) -> tuple[Rays, Float[Array, "rays"]]:
-    """The rays of some pixels inside the volume (and its clipping box), and the distance from the eye to their entry."""
-    origin, direction = camera.rays(pixels)
+def enter(scene: Scene, origin: Triple, direction: Triple) -> tuple[Rays, Float[Array, "rays"]]:
+    """World rays inside the volume (and its clipping box), and the distance from their origin to where they enter.
+
+    A ray with non-finite numbers gets the length NaN, which `composite` turns into a NaN pixel.
+    """
     start = scene.volume.grid_from_world(origin)
     along = scene.volume.grid_from_world(direction, direction=True)
     t_in, t_out = ray_box(start, along, *scene.volume.domain)
@@ -83,27 +83,28 @@ def camera_rays(scene: Scene, camera: AbstractCamera, pixels: Int[Array, "rays"]
     # A ray that misses gets harmless numbers before any arithmetic, so that its derivative is zero and not 0 * inf.
     t_in, t_out = jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0)
     keep = lambda v: tuple(jnp.where(hit, x, 0.0) for x in v)
+    poison = jnp.where(jnp.isfinite(sum(start) + sum(along)), 0.0, jnp.nan)
     start, along = keep(start), keep(along)
     entry = tuple(s + t_in * d for s, d in zip(start, along, strict=True))
-    return Rays(entry, along, t_out - t_in), t_in
+    return Rays(entry, along, t_out - t_in + poison), t_in
 
 
-def composite(scene: Scene, gathered: Marched) -> tuple[Triple, Float[Array, "rays"]]:
+def composite(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> tuple[Triple, Float[Array, "rays"]]:
     """Colour of each ray with the background behind the medium, and the medium's opacity."""
     transmittances = tuple(jnp.exp(-tau) for tau in gathered.tau)
-    zero = jnp.zeros(gathered.steps.shape, jnp.result_type(float))
-    rgb = gathered.radiance or (zero, zero, zero)
+    zero = jnp.where(jnp.isnan(length), jnp.nan, 0.0)
+    rgb = tuple(zero + L for L in gathered.radiance or (0.0, 0.0, 0.0))
     if scene.background is not None:
         clear = transmittances * (3 // len(transmittances)) if transmittances else (1.0, 1.0, 1.0)
         rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, scene.background, strict=True))
-    # expm1 and not 1 - T: thin media keep their digits.
-    alpha = sum((-jnp.expm1(-tau) for tau in gathered.tau), zero) / max(len(gathered.tau), 1)
+    # Not 1 - T: thin media keep their digits.
+    alpha = sum((one_minus_exp(tau) for tau in gathered.tau), zero) / max(len(gathered.tau), 1)
     return rgb, alpha
 
 
 def _render_pixels(scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"]):
-    gathered, _, t_in = trace(scene, camera, settings, pixels, distance=True)
-    rgb, alpha = composite(scene, gathered)
+    gathered, rays, t_in = trace(scene, camera, settings, pixels, distance=True)
+    rgb, alpha = composite(scene, gathered, rays.length)
     weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
     depth = jnp.where(alpha > 0, t_in + divide_or_zero(weighted, alpha), 0.0)
     return jnp.stack(rgb, axis=-1), alpha, depth, gathered.steps

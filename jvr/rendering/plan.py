@@ -1,9 +1,16 @@
 """What of a scene is in the compiled program, decided from its structure alone."""
 
-from jvr.march.march import AbstractShader
+import dataclasses
+
+import jax
+
+from jvr.march.fields import VoxelField
+from jvr.march.march import AbstractShader, Medium
 from jvr.march.steps import Point
-from jvr.model.optical import AbstractOpticalModel
+from jvr.model.optical import AbstractOpticalModel, EmissionOnly
+from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
+from jvr.rendering.settings import Settings
 from jvr.types import Channels, Scalar
 
 
@@ -14,3 +21,52 @@ class OpticalShader(AbstractShader):
 
     def segment(self, medium: Classified, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         return self.optical.segment(medium, dt)
+
+
+def medium(scene: Scene) -> Medium:
+    """What of a scene rays march through."""
+    return Medium(VoxelField(scene.volume), scene.transfer, OpticalShader(scene.optical))
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One part of the compiled program: its name, whether it is in, and why or why not."""
+
+    name: str
+    included: bool
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What a rendering compiles to. Equal plans compile to the same program; `print` explains it."""
+
+    parts: tuple[Part, ...]
+    key: str
+
+    def __str__(self) -> str:
+        width = max(len(part.name) for part in self.parts)
+        return "\n".join(f"{'+' if part.included else '-'} {part.name:<{width}}  {part.reason}" for part in self.parts)
+
+
+def plan(scene: Scene, settings: Settings = Settings()) -> Plan:
+    """What `render(scene, camera, settings)` puts into the compiled program, and why.
+
+    A pure function of the scene's structure (which parts there are, shapes, types, static choices) and of the settings, never of the
+    values of arrays: a scene with other numbers has the same plan and is not compiled again. Hashable.
+    """
+    volume, transfer = scene.volume, scene.transfer
+    voxels = f"{'x'.join(map(str, volume.shape))} {volume.values.dtype}"
+    coloured = any(getattr(transfer, name, transfer.rgb).ndim == 2 for name in ("sigma_t", "height") if hasattr(transfer, name))
+    transparent = isinstance(scene.optical, EmissionOnly)
+    termination = f"rays end at transmittance {settings.termination:g}" if settings.termination > 0 else "rays run to their end"
+    parts = (
+        Part("volume", True, f"{voxels}, {type(volume.interpolation).__name__.lower()}, a sample every {settings.step:g} voxels"),
+        Part("transfer", True, f"{type(transfer).__name__}, {'coloured' if coloured else 'grey'} extinction"),
+        Part("optical model", True, type(scene.optical).__name__),
+        Part("early termination", settings.termination > 0 and not transparent, "nothing absorbs" if transparent else termination),
+        Part("background", scene.background is not None, "shows through" if scene.background is not None else "the scene names none"),
+        Part("clipping", scene.clipping is not None, "rays are cut" if scene.clipping is not None else "the scene names none"),
+        Part("derivatives", True, f"{type(settings.adjoint).__name__}, if any are asked for"),
+    )
+    return Plan(parts, f"{jax.tree.structure((scene, settings))} {jax.tree.map(lambda x: (x.shape, str(x.dtype)), jax.tree.leaves(scene))}")

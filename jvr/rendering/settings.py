@@ -26,7 +26,14 @@ class Settings(eqx.Module):
     adjoint: AbstractAdjoint
     tile: int = eqx.field(static=True)
 
-    def __init__(self, step: float = 0.5, *, termination: float = 1e-4, adjoint: AbstractAdjoint = Replay(), tile: int = 262_144):
+    def __init__(
+        self,
+        step: float | int = 0.5,
+        *,
+        termination: float | int = 1e-4,
+        adjoint: AbstractAdjoint = Replay(),
+        tile: int = 262_144,
+    ):
         if isinstance(step, bool) or not isinstance(step, int | float) or not (math.isfinite(step) and step > 0):
             raise ValueError(f"step must be a positive number of voxels, not {step!r}; 0.5 is a good start")
         if not isinstance(termination, int | float) or not 0 <= termination < 1:

@@ -1,0 +1,279 @@
+"""`jvr.fit`: the scene that explains the images."""
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from jvr.fitting import checkpoint as checkpoints
+from jvr.fitting.identifiability import Determination
+from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
+from jvr.fitting.objective import Problem, march_unknowns, predict
+from jvr.fitting.observations import Observations, check_images, keep_samples, observe
+from jvr.fitting.solvers import LBFGSB, AbstractSolver, ChunkedLeastSquares, LevenbergMarquardt, OptimistixSolver
+from jvr.fitting.unknowns import Exposed, Identity, Softplus, Unknowns, choose_unknowns
+from jvr.fitting.work import Work, fingerprint
+from jvr.model.camera import AbstractCamera
+from jvr.model.scene import Scene
+from jvr.rendering.image import trace
+from jvr.rendering.settings import Settings
+from jvr.types import Outcome
+
+# Rays whose rows are held at a time; smaller batches lose the second core, larger ones fall out of the cache.
+CHUNK = 16_384
+# Kept samples are given up where they would take more than this many bytes.
+KEEP_LIMIT = 2**30
+# The Jacobian of other unknowns than a table's entries takes one march for each.
+MOST_FORWARD = 512
+
+
+class Iteration(NamedTuple):
+    """One line of a fit's history: `loss` is the objective, `psnr` in decibels relative to radiance 1 (of the rays in use),
+    `seconds` since the start, `rays` the share of all rays in use."""
+
+    step: int
+    loss: float
+    psnr: float
+    seconds: float
+    rays: float
+
+
+class FitStats(NamedTuple):
+    """What a fit took and how well it is determined.
+
+    - `seconds`; `kept_bytes`: of samples kept along the rays, 0 where they were resampled.
+    - `residual_variance`, `rank`, `condition`: of the Gauss-Newton matrix at the end, see `jvr.fitting.identifiability`.
+    - `worst`: the worst-determined combination of unknowns, as (name, coefficient), largest first.
+    - `held_out`: (PSNR, SSIM) of each held-out view, radiance 0 ... 1.
+    """
+
+    seconds: float
+    kept_bytes: int
+    residual_variance: float
+    rank: int
+    condition: float
+    worst: tuple[tuple[str, float], ...]
+    held_out: tuple[tuple[float, float], ...]
+
+
+class FitResult(NamedTuple):
+    """What `jvr.fit` returns.
+
+    - `scene`: the fitted scene.
+    - `history`: one `Iteration` for each step.
+    - `standard_errors`: of every fitted value, in the structure of `unknowns(scene)`; infinite where the images do not determine it.
+    - `outcome`: how the iteration ended.
+    - `exposure`: the fitted factor between rendered and target radiance, 1 where it was not asked for.
+    - `stats`: `FitStats`.
+    """
+
+    scene: Scene
+    history: tuple[Iteration, ...]
+    standard_errors: Any
+    outcome: Outcome
+    exposure: float
+    stats: FitStats
+
+
+def fit(
+    scene: Scene,
+    cameras: Sequence[AbstractCamera],
+    images: Any,
+    *,
+    unknowns: Callable[[Scene], Any],
+    settings: Settings = Settings(),
+    solver: AbstractSolver | optx.AbstractMinimiser | optx.AbstractLeastSquaresSolver | None = None,
+    loss: AbstractLoss | DSSIM = SquaredError(),
+    priors: Sequence[AbstractPrior] = (),
+    transforms: Any = None,
+    weights: Sequence[Any] | None = None,
+    exposure: bool = False,
+    held_out: tuple[Sequence[AbstractCamera], Any] | None = None,
+    keep_samples: bool | int = True,
+    max_steps: int = 100,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    progress: bool | Callable[[Iteration], None] | None = None,
+) -> FitResult:
+    """Finds the values of some arrays of a scene that make it look like the images.
+
+    **Arguments:**
+
+    - `scene`: where the fit starts; what is not unknown stays as it is.
+    - `cameras`, `images`: one target image `(height, width, 3)`, linear radiance, for each camera.
+    - `unknowns`: picks arrays out of the scene, for example `lambda s: (s.transfer.rgb, s.transfer.sigma_t)`.
+    - `solver`: `None` is `jvr.LevenbergMarquardt()`; also `jvr.GaussNewton()`, `jvr.Dogleg()`, `jvr.LBFGSB()`, or any minimiser or
+      least-squares solver of Optimistix.
+    - `loss`: `jvr.SquaredError()`, `jvr.Huber()`, `jvr.AbsoluteError()` or, for solvers that use gradients alone, `jvr.DSSIM()`.
+    - `priors`: penalties added to the mean loss; `transforms`: one for each unknown array, see `jvr.fitting.unknowns`.
+    - `weights`: one `(height, width)` array for each image, not negative.
+    - `exposure`: also fit the factor between rendered and target radiance.
+    - `held_out`: `(cameras, images)` that are only compared with at the end.
+    - `keep_samples`: keep the resampled values along all rays (2 bytes each) while the volume is not unknown, so that no step touches
+      the volume again; a number is the most bytes to take (`True`: 1 GiB), beyond which every step resamples.
+    - `max_steps`: iterations at most. `checkpoint`: a file written after every iteration, from which `resume=True` goes on.
+    - `progress`: `None` shows a bar on stderr where that is a terminal; a function is called with each `Iteration`.
+
+    Standard errors are those of weighted least squares at the solution, in the values' own coordinates, priors excluded; with a
+    robust loss its final weights count as the weights. `settings.adjoint` plays no part: each solver has its own.
+
+    **Raises** `ValueError` for images that do not fit the cameras, unknowns that are not arrays of the scene, too many unknowns for
+    a least-squares solver, or a loss that the solver cannot use. A non-finite value ends the fit with that outcome and the last good
+    iterate.
+    """
+    began = time.perf_counter()
+    solver = _as_solver(solver)
+    targets = check_images(cameras, images)
+    model = Exposed(scene, jnp.ones(()) if exposure else None)
+    chosen = _choose(model, unknowns, transforms, solver)
+    problem = Problem(model, chosen, settings, loss, tuple(priors), None)
+    _check(problem, solver)
+
+    chunk = min(CHUNK, sum(camera.width * camera.height for camera in cameras))
+    observations = observe(scene, cameras, targets, weights, settings, chunk)
+    problem, observations = _keep(problem, observations, chunk, keep_samples)
+    work = Work(problem, observations, chunk, cameras, targets)
+    mark = fingerprint(problem, observations, solver) if checkpoint else ""
+    state, history = solver.init(work.functions, chosen.real_from_model(model)), []
+    if checkpoint and resume and Path(checkpoint).exists():
+        state, rows = checkpoints.load(Path(checkpoint), state, mark)
+        history = [Iteration(**row) for row in rows]
+        began -= history[-1].seconds if history else 0.0
+
+    outcome = solver.outcome(state)
+    with _progress(progress, max_steps) as show:
+        while outcome is None and len(history) < max_steps:
+            state = solver.step(work.functions, state)
+            history.append(_iteration(work, solver, state, len(history) + 1, time.perf_counter() - began))
+            if checkpoint:
+                checkpoints.save(Path(checkpoint), state, [entry._asdict() for entry in history], mark)
+            show(history[-1])
+            outcome = solver.outcome(state)
+
+    real, _ = solver.iterate(state)
+    values = chosen.values_from_real(jnp.asarray(real), model)
+    found = chosen.insert(model, chosen.split(values, model))
+    known = work.determination(values)
+    errors = chosen.split(jnp.asarray(known.standard_errors), model)
+    selected, structure = jax.tree.flatten(unknowns(scene))
+    stats = FitStats(
+        seconds=time.perf_counter() - began,
+        kept_bytes=0 if problem.samples is None else problem.samples.bytes,
+        residual_variance=known.variance,
+        rank=known.rank,
+        condition=known.condition,
+        worst=_worst(chosen, model, known),
+        held_out=() if held_out is None else _compare(problem, found, *held_out),
+    )
+    return FitResult(
+        scene=found.scene,
+        history=tuple(history),
+        standard_errors=jax.tree.unflatten(structure, errors[: len(selected)]),
+        outcome=outcome or Outcome.STEP_LIMIT,
+        exposure=1.0 if found.exposure is None else float(found.exposure),
+        stats=stats,
+    )
+
+
+def _as_solver(solver: Any) -> AbstractSolver:
+    if solver is None:
+        return LevenbergMarquardt()
+    if isinstance(solver, AbstractSolver):
+        return solver
+    if isinstance(solver, optx.AbstractMinimiser | optx.AbstractLeastSquaresSolver):
+        return OptimistixSolver(solver)
+    raise TypeError(f"solver must be one of jvr's or Optimistix's, not {type(solver).__name__}")
+
+
+def _choose(model: Exposed, unknowns: Callable[[Scene], Any], transforms: Any, solver: AbstractSolver) -> Unknowns:
+    """The scene's unknowns and then the exposure. A bounded solver works on the values themselves."""
+    select = lambda m: (unknowns(m.scene), m.exposure)
+    if transforms is not None:
+        transforms = (*transforms, *([Softplus()] if model.exposure is not None else []))
+    elif isinstance(solver, LBFGSB):
+        transforms = (Identity(),) * len(jax.tree.leaves(select(model)))
+    return choose_unknowns(model, select, transforms)
+
+
+def _check(problem: Problem, solver: AbstractSolver) -> None:
+    """Combinations that cannot work."""
+    is_least_squares = isinstance(solver, ChunkedLeastSquares) or (
+        isinstance(solver, OptimistixSolver) and isinstance(solver.solver, optx.AbstractLeastSquaresSolver)
+    )
+    if is_least_squares and isinstance(problem.loss, DSSIM):
+        raise ValueError("DSSIM is not a sum over pixels and has no least-squares form: use solver=optimistix.BFGS(rtol=1e-6, atol=1e-8)")
+    if isinstance(solver, OptimistixSolver) and is_least_squares and not (type(problem.loss) is SquaredError and not problem.priors):
+        raise ValueError("Optimistix's least-squares solvers take squared errors without priors: use jvr.LevenbergMarquardt()")
+    inner = march_unknowns(problem)
+    if is_least_squares and inner > MOST_FORWARD:
+        raise ValueError(
+            f"{inner:,} unknowns are too many for a least-squares solver (at most {MOST_FORWARD} beside a table's entries): "
+            "use solver=optimistix.LBFGS(rtol=1e-6, atol=1e-8)"
+        )
+
+
+def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool | int) -> tuple[Problem, Observations]:
+    """Samples along the rays, where the volume and its clipping are known and memory allows."""
+    moving = any(name.startswith(("scene.volume", "scene.clipping")) for name in problem.unknowns.names)
+    if keep is False or moving or isinstance(problem.loss, DSSIM):
+        return problem, observations
+    limit = KEEP_LIMIT if keep is True else keep
+    kept = keep_samples(problem.model.scene, observations, problem.settings, chunk, limit)
+    if kept is None:
+        return problem, observations
+    return problem.with_samples(kept[0]), kept[1]
+
+
+def _iteration(work: Work, solver: AbstractSolver, state: Any, step: int, seconds: float) -> Iteration:
+    _, loss = solver.iterate(state)
+    level = int(getattr(state, "level", len(work.levels) - 1))
+    return Iteration(step, loss, work.psnr(loss, getattr(state, "normal", None)), seconds, work.levels[level].size / work.rays)
+
+
+def _worst(chosen: Unknowns, model: Exposed, known: Determination, most: int = 6) -> tuple[tuple[str, float], ...]:
+    """The largest coefficients of the worst-determined combination, with the names of their unknowns."""
+    labels = []
+    for name, array in zip(chosen.names, chosen.values(model), strict=True):
+        labels += [f"{name.removeprefix('scene.')}[{', '.join(map(str, i))}]" for i in np.ndindex(array.shape)]
+    order = np.argsort(-np.abs(known.worst))[:most]
+    return tuple((labels[i], float(known.worst[i])) for i in order)
+
+
+def _compare(problem: Problem, found: Exposed, cameras: Sequence[AbstractCamera], images: Any) -> tuple[tuple[float, float], ...]:
+    """PSNR and SSIM of views that took no part in the fit."""
+    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+    scores = []
+    for camera, target in zip(cameras, check_images(cameras, images, "held-out image"), strict=True):
+        gathered, rays, _ = trace(found.scene, camera, problem.settings, jnp.arange(camera.width * camera.height, dtype=jnp.int32))
+        rendered = np.stack(predict(problem, found, gathered, rays.length), axis=-1).reshape(target.shape)
+        psnr = peak_signal_noise_ratio(target, rendered, data_range=1.0)
+        window = min(7, *target.shape[:2]) // 2 * 2 - 1 if min(target.shape[:2]) < 7 else 7
+        ssim = structural_similarity(target, rendered, data_range=1.0, channel_axis=-1, win_size=window)
+        scores.append((float(psnr), float(ssim)))
+    return tuple(scores)
+
+
+@contextlib.contextmanager
+def _progress(progress: Any, max_steps: int) -> Iterator[Callable[[Iteration], None]]:
+    """A function to call after each iteration."""
+    if callable(progress):
+        yield progress
+    elif progress is False or (progress is None and not sys.stderr.isatty()):
+        yield lambda _: None
+    else:
+        from rich.console import Console
+        from rich.progress import Progress
+
+        with Progress(console=Console(stderr=True)) as bar:
+            task = bar.add_task("fit", total=max_steps)
+            yield lambda entry: bar.update(
+                task, completed=entry.step, description=f"step {entry.step}  loss {entry.loss:.3e}  PSNR {entry.psnr:.1f} dB"
+            )

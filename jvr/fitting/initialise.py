@@ -1,0 +1,59 @@
+"""Where a fit starts."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jvr.fitting.losses import SquaredError
+from jvr.fitting.objective import Problem, normal_equations
+from jvr.fitting.observations import check_images, observe
+from jvr.fitting.unknowns import Exposed, choose_unknowns
+from jvr.model.camera import AbstractCamera
+from jvr.model.scene import Scene
+from jvr.model.transfer import AbstractTable, LutTransfer
+from jvr.model.volume import Volume
+from jvr.rendering.settings import Settings
+
+
+def flat_transfer(volume: Volume, entries: int = 64, *, opacity: float = 0.018, grey: float = 0.5) -> LutTransfer:
+    """A transfer function that says nothing yet: one grey, one thin extinction, over the range of the volume's values.
+
+    **Arguments:** `entries`: of the table; `opacity`: optical depth of one voxel; `grey`: colour of every entry.
+    """
+    ends = np.sort([float(volume.slope * v + volume.intercept) for v in (jnp.min(volume.values), jnp.max(volume.values))])
+    if not ends[0] < ends[1]:
+        raise ValueError(f"every voxel has the value {ends[0]:g}: a transfer function cannot be fitted to a constant volume")
+    sigma_t = opacity / float(jnp.min(volume.spacing))
+    return LutTransfer(np.full((entries, 3), grey), np.full(entries, sigma_t), ends)
+
+
+def colours_given_extinction(
+    scene: Scene, cameras: Sequence[AbstractCamera], images: Any, settings: Settings = Settings(), *, ridge: float = 1e-6
+) -> Scene:
+    """The scene with the colours of its table that explain the images best while its extinctions stay as they are.
+
+    With extinction given, a ray's radiance is linear in the colours, so this is one linear least-squares problem of `entries`
+    unknowns for each channel (the idea of Neuhauser and Westermann 2023, solved over entries instead of voxels). Entries that no ray
+    sees keep their colour; colours are clipped to 0 ... 1.
+
+    **Raises** `ValueError` where the transfer function is not a table, or the images do not fit the cameras.
+    """
+    if not isinstance(scene.transfer, AbstractTable):
+        raise ValueError(f"colours can be solved for in a table, not in {type(scene.transfer).__name__}")
+    targets = check_images(cameras, images)
+    unknowns = choose_unknowns(Exposed(scene, None), lambda m: m.scene.transfer.rgb)
+    problem = Problem(Exposed(scene, None), unknowns, settings, SquaredError(), (), None)
+    chunk = min(16_384, sum(camera.width * camera.height for camera in cameras))
+    start = jnp.ravel(scene.transfer.rgb)
+    matrix, vector = np.zeros((start.size,) * 2), np.zeros(start.size)
+    for piece in observe(scene, cameras, targets, None, settings, chunk).chunks(chunk):
+        normal = normal_equations(problem, start, piece)
+        matrix += np.asarray(normal.matrix, np.float64)
+        vector += np.asarray(normal.vector, np.float64)
+    scale = max(np.diag(matrix).max(), np.finfo(float).tiny)
+    move = np.linalg.solve(matrix + ridge * scale * np.eye(start.size), -vector)
+    rgb = np.clip(np.asarray(start) + move, 0, 1).reshape(scene.transfer.rgb.shape)
+    return eqx.tree_at(lambda s: s.transfer.rgb, scene, jnp.asarray(rgb, scene.transfer.rgb.dtype))

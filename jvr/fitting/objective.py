@@ -1,0 +1,222 @@
+"""The objective of a fit: its value for solvers that use gradients, and its normal equations for those that use the Jacobian.
+
+Both go through the rays in chunks, so that a matrix of all rays is never held.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior
+from jvr.fitting.observations import Observations, Samples, observed_medium
+from jvr.fitting.unknowns import Exposed, Unknowns
+from jvr.march.differentiation import Forward, Replay
+from jvr.march.march import Marched, MarchOptions
+from jvr.march.rows import TableRows, table_rows
+from jvr.model.camera import AbstractCamera
+from jvr.model.transfer import AbstractTable
+from jvr.rendering.image import composite, step_length, trace
+from jvr.rendering.settings import Settings
+from jvr.types import Scalar, Triple
+
+
+class Problem(eqx.Module):
+    """A fit without its observations: what is unknown, how it is rendered, what is made small."""
+
+    model: Exposed
+    unknowns: Unknowns
+    settings: Settings
+    loss: AbstractLoss | DSSIM
+    priors: tuple[AbstractPrior, ...]
+    samples: Samples | None
+
+    def with_samples(self, samples: Samples) -> "Problem":
+        return Problem(self.model, self.unknowns, self.settings, self.loss, self.priors, samples)
+
+
+class Normal(NamedTuple):
+    """Sums over rays at one point, in the unknowns' own values `v`, with weights `w` (per pixel, times the loss's own).
+
+    `loss = sum w rho(r)`, `squares = sum w r^2`, `matrix = sum w J^T J`, `vector = sum w J^T r`.
+    """
+
+    loss: Any
+    squares: Any
+    matrix: Any
+    vector: Any
+
+
+Blocks = list[tuple[Float[Array, "rays columns"], np.ndarray]]
+
+
+def predict(problem: Problem, model: Exposed, gathered: Marched, length: Float[Array, "rays"]) -> Triple:
+    """Colours as the target images have them."""
+    rgb, _ = composite(model.scene, gathered, length)
+    return rgb if model.exposure is None else tuple(model.exposure * c for c in rgb)
+
+
+@eqx.filter_jit
+def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Scalar:
+    """Mean loss over all pixels plus priors, as a function of the unknowns on the real line. `pieces` has a leading axis of chunks."""
+    model = problem.unknowns.model_from_real(problem.model, real)
+
+    def add_piece(sum_: Scalar, piece: Observations) -> tuple[Scalar, None]:
+        r = residual(problem, model, piece)
+        return sum_ + sum(jnp.sum(piece.weight * problem.loss.value(c)) for c in r), None
+
+    loss, _ = jax.lax.scan(add_piece, jnp.zeros((), real.dtype), pieces)
+    return loss / total + prior(problem, model)
+
+
+def residual(problem: Problem, model: Exposed, piece: Observations) -> Triple:
+    """Rendered minus target in each channel; reverse mode."""
+    medium, rays = observed_medium(model.scene, piece, problem.samples)
+    options = MarchOptions(problem.settings.termination, distance=False)
+    gathered = Replay().march(options, medium, rays, step_length(model.scene, problem.settings))
+    colours = predict(problem, model, gathered, rays.length)
+    return tuple(c - piece.target[:, i] for i, c in enumerate(colours))
+
+
+@eqx.filter_jit
+def image_value(
+    problem: Problem, real: Float[Array, "unknowns"], cameras: Sequence[AbstractCamera], images: Sequence[Array]
+) -> Scalar:
+    """`value` for a loss over whole images: the mean over images plus priors."""
+    model = problem.unknowns.model_from_real(problem.model, real)
+    settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
+    losses = []
+    for camera, target in zip(cameras, images, strict=True):
+        gathered, rays, _ = trace(model.scene, camera, settings, jnp.arange(camera.width * camera.height, dtype=jnp.int32))
+        rendered = jnp.stack(predict(problem, model, gathered, rays.length), axis=-1).reshape(target.shape)
+        losses.append(problem.loss.image(rendered, target))
+    return sum(losses) / len(losses) + prior(problem, model)
+
+
+def prior(problem: Problem, model: Exposed) -> Scalar | float:
+    """The sum of all priors."""
+    return sum(p.value(model.scene) for p in problem.priors)
+
+
+@eqx.filter_jit
+def prior_expansion(problem: Problem, values: Float[Array, "unknowns"]) -> tuple[Any, Any, Any]:
+    """Value, gradient and Hessian of the priors in the unknowns' own values."""
+    unknowns, model = problem.unknowns, problem.model
+
+    def of_values(values: Array) -> Array:
+        return jnp.asarray(prior(problem, unknowns.insert(model, unknowns.split(values, model))), values.dtype)
+
+    return of_values(values), jax.grad(of_values)(values), jax.hessian(of_values)(values)
+
+
+@eqx.filter_jit
+def normal_equations(problem: Problem, values: Float[Array, "unknowns"], piece: Observations) -> Normal:
+    """The sums of `Normal` over one chunk of rays."""
+    colours, blocks = _jacobian(problem, values, piece)
+    n = values.shape[0]
+    total = Normal(jnp.zeros(()), jnp.zeros(()), jnp.zeros((n, n), values.dtype), jnp.zeros(n, values.dtype))
+    for c, colour in enumerate(colours):
+        r = colour - piece.target[:, c]
+        weight = piece.weight * problem.loss.weight(r)
+        jacobian = jnp.concatenate([block for block, _ in blocks[c]], axis=1)
+        columns = np.concatenate([columns for _, columns in blocks[c]])
+        weighted = jacobian * weight[:, None]
+        total = Normal(
+            total.loss + jnp.sum(piece.weight * problem.loss.value(r)),
+            total.squares + jnp.sum(weight * jnp.square(r)),
+            # Highest: on accelerators the default would round to fewer bits than the small eigenvalues need.
+            total.matrix.at[np.ix_(columns, columns)].add(jnp.matmul(weighted.T, jacobian, precision="highest")),
+            total.vector.at[columns].add(jnp.matmul(weighted.T, r, precision="highest")),
+        )
+    return total
+
+
+def _jacobian(problem: Problem, values: Float[Array, "unknowns"], piece: Observations) -> tuple[Triple, list[Blocks]]:
+    """Predicted colours of a chunk, and for each channel blocks of its Jacobian with the unknowns that they belong to."""
+    unknowns = problem.unknowns
+    model = unknowns.insert(problem.model, unknowns.split(values, problem.model))
+    entries, outer, inner = _kinds(problem)
+    medium, rays = observed_medium(model.scene, piece, problem.samples)
+    options = MarchOptions(problem.settings.termination, distance=False)
+    dt = step_length(model.scene, problem.settings)
+    blocks: list[Blocks] = [[], [], []]
+    if entries:
+        gathered, rows = table_rows(options, medium, rays, dt)
+        _add_entries(problem, model, gathered, rows, rays.length, entries, blocks)
+    else:
+        gathered = Forward().march(options, medium, rays, dt)
+    replace = lambda columns, part: unknowns.insert(problem.model, unknowns.split(values.at[columns].set(part), problem.model))
+    if outer:
+        columns = np.concatenate([columns for columns in outer.values()])
+        of_outer = jax.jacfwd(lambda part: predict(problem, replace(columns, part), gathered, rays.length))(values[columns])
+        for c in range(3):
+            blocks[c].append((of_outer[c], columns))
+    if inner:
+        columns = np.concatenate([columns for columns in inner.values()])
+
+        def of_inner(part: Array) -> Triple:
+            changed = replace(columns, part)
+            medium, rays = observed_medium(changed.scene, piece, problem.samples)
+            gathered = Forward().march(options, medium, rays, step_length(changed.scene, problem.settings))
+            return predict(problem, changed, gathered, rays.length)
+
+        jacobian = jax.jacfwd(of_inner)(values[columns])
+        for c in range(3):
+            blocks[c].append((jacobian[c], columns))
+    return predict(problem, model, gathered, rays.length), blocks
+
+
+def march_unknowns(problem: Problem) -> int:
+    """How many unknowns act inside the march without being entries of a table."""
+    return sum(columns.size for columns in _kinds(problem)[2].values())
+
+
+def _kinds(problem: Problem) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Columns of the unknowns that are entries of a table (rows), act after the march (outer), or act inside it (inner)."""
+    entries: dict[str, np.ndarray] = {}
+    outer: dict[str, np.ndarray] = {}
+    inner: dict[str, np.ndarray] = {}
+    begin = 0
+    for name, array in zip(problem.unknowns.names, problem.unknowns.values(problem.model), strict=True):
+        columns = np.arange(begin, begin + array.size).reshape(array.shape)
+        begin += array.size
+        is_table = isinstance(problem.model.scene.transfer, AbstractTable)
+        if is_table and name in ("scene.transfer.rgb", "scene.transfer.sigma_t"):
+            entries[name] = columns
+        elif name in ("scene.background", "exposure"):
+            outer[name] = columns.ravel()
+        else:
+            inner[name] = columns.ravel()
+    return entries, outer, inner
+
+
+def _add_entries(
+    problem: Problem,
+    model: Exposed,
+    gathered: Marched,
+    rows: TableRows,
+    length: Float[Array, "rays"],
+    entries: dict[str, np.ndarray],
+    blocks: list[Blocks],
+) -> None:
+    """Chains the rows of the march with what happens to radiance and optical depth after it, channel by channel."""
+    ones = jax.tree.map(jnp.ones_like, (gathered.radiance, gathered.tau))
+    zeros = jax.tree.map(jnp.zeros_like, ones)
+    final = lambda radiance, tau: predict(problem, model, gathered._replace(radiance=radiance, tau=tau), length)
+    _, by_radiance = jax.jvp(final, (gathered.radiance, gathered.tau), (ones[0], zeros[1]))
+    _, by_tau = jax.jvp(final, (gathered.radiance, gathered.tau), (zeros[0], ones[1]))
+    rgb, sigma_t = entries.get("scene.transfer.rgb"), entries.get("scene.transfer.sigma_t")
+    for c in range(3):
+        if rgb is not None and rows.radiance_rgb:
+            blocks[c].append((rows.radiance_rgb[c] * by_radiance[c][:, None], rgb[:, c]))
+        if sigma_t is not None:
+            block = jnp.zeros((length.shape[0], sigma_t.shape[0]), length.dtype)
+            if rows.radiance_sigma:
+                block += rows.radiance_sigma[c] * by_radiance[c][:, None]
+            if rows.tau_sigma:
+                block += rows.tau_sigma[c % len(rows.tau_sigma)] * by_tau[c][:, None]
+            blocks[c].append((block, sigma_t if sigma_t.ndim == 1 else sigma_t[:, c]))

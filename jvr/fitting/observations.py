@@ -1,0 +1,167 @@
+"""Target images as one long list of rays with their target colours, and samples kept along them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jvr.march.fields import KeptField
+from jvr.march.march import Medium
+from jvr.march.steps import Rays, points_at, segment, segment_count
+from jvr.model.camera import AbstractCamera
+from jvr.model.scene import Scene
+from jvr.rendering.image import enter, step_length
+from jvr.rendering.plan import medium
+from jvr.rendering.settings import Settings
+from jvr.types import Triple
+
+
+class Observations(eqx.Module):
+    """World rays with the colour that each should have. Rays that cross more of the volume come first.
+
+    `weight` is 0 for the rays that fill up the last chunk. `start` is where a ray's kept samples begin, all 0 without any.
+    """
+
+    origin: Triple
+    direction: Triple
+    target: Float[Array, "rays 3"]
+    weight: Float[Array, "rays"]
+    start: Int[Array, "rays"]
+
+    @property
+    def size(self) -> int:
+        return self.weight.shape[0]
+
+    def chunks(self, size: int) -> list["Observations"]:
+        """Pieces of `size` rays."""
+        return [jax.tree.map(lambda x: x[i : i + size], self) for i in range(0, self.size, size)]
+
+
+class Samples(eqx.Module):
+    """Scalars along every ray, 16 bits each, in blocks of `stride` rays: sample `k` of a ray is at `start + k * stride`."""
+
+    stored: Any
+    low: Float[Array, ""]
+    scale: Float[Array, ""]
+    stride: int = eqx.field(static=True)
+
+    @property
+    def bytes(self) -> int:
+        return self.stored.size * self.stored.dtype.itemsize
+
+
+def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "target image") -> list[np.ndarray]:
+    """The images as float arrays, one for each camera and of its size.
+
+    **Raises** `ValueError` where their number or a size differs, or a pixel is not finite.
+    """
+    images = [np.asarray(image, dtype=np.float32 if not jax.config.jax_enable_x64 else np.float64) for image in images]
+    if len(images) != len(cameras) or not images:
+        raise ValueError(f"there are {len(images)} images for {len(cameras)} cameras: give one image for each camera, and at least one")
+    for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        if image.shape != (camera.height, camera.width, 3):
+            raise ValueError(
+                f"{name} {i} has shape {image.shape}, its camera sees {(camera.height, camera.width, 3)}: resize the image or the camera"
+            )
+        if not np.all(np.isfinite(image)):
+            raise ValueError(f"{name} {i} has {np.sum(~np.isfinite(image))} values that are not finite: give them weight 0 and replace them")
+    return images
+
+
+def observe(
+    scene: Scene,
+    cameras: Sequence[AbstractCamera],
+    images: Sequence[np.ndarray],
+    weights: Sequence[Any] | None,
+    settings: Settings,
+    chunk: int,
+) -> Observations:
+    """All pixels of all images as observations, sorted by the length of their rays and filled up to whole chunks."""
+    rays = [camera.rays(jnp.arange(camera.width * camera.height, dtype=jnp.int32)) for camera in cameras]
+    origin, direction = jax.tree.map(lambda *parts: np.concatenate(parts), *rays)
+    target = np.concatenate([image.reshape(-1, 3) for image in images])
+    weight = np.concatenate([w.ravel() for w in _check_weights(cameras, weights, target.dtype)])
+    inside, _ = jax.jit(enter)(scene, tuple(map(jnp.asarray, origin)), tuple(map(jnp.asarray, direction)))
+    order = np.argsort(-np.asarray(inside.length), kind="stable")
+    fill = -len(order) % chunk
+    order = np.concatenate([order, np.full(fill, order[-1])])
+    weight = weight[order]
+    weight[len(order) - fill :] = 0
+    take = lambda x: jnp.asarray(x[order])
+    start = jnp.zeros(len(order), jnp.int32)
+    return Observations(jax.tree.map(take, origin), jax.tree.map(take, direction), take(target), jnp.asarray(weight), start)
+
+
+def thin(observations: Observations, every: int, chunk: int) -> Observations:
+    """Every `every`-th observation, filled up to whole chunks."""
+    index = np.arange(0, observations.size, every)
+    fill = -len(index) % chunk
+    thinned = jax.tree.map(lambda x: x[np.concatenate([index, np.zeros(fill, int)])], observations)
+    return eqx.tree_at(lambda o: o.weight, thinned, thinned.weight.at[len(index) :].set(0))
+
+
+def keep_samples(
+    scene: Scene, observations: Observations, settings: Settings, chunk: int, limit: int
+) -> tuple[Samples, Observations] | None:
+    """Resamples the volume along every ray once, 16 bits a sample, or returns `None` where that would take more than `limit` bytes.
+
+    The error of a kept sample is at most 2^-17 of the range of the volume's values.
+    """
+    pieces = observations.chunks(chunk)
+    counts = [int(_longest(scene, piece, settings)) for piece in pieces]
+    total = chunk * sum(counts)
+    if 2 * total > limit or total >= 2**31:
+        return None
+    low = scene.volume.slope * jnp.min(scene.volume.values) + scene.volume.intercept
+    high = scene.volume.slope * jnp.max(scene.volume.values) + scene.volume.intercept
+    low, high = jnp.minimum(low, high), jnp.maximum(low, high)
+    scale = jnp.where(high > low, (high - low) / 65535, 1.0)
+    stored = np.empty(total, np.uint16)
+    starts, begin = [], 0
+    for piece, count in zip(pieces, counts, strict=True):
+        for k in range(count):
+            stored[begin + k * chunk : begin + (k + 1) * chunk] = _resample(scene, piece, settings, jnp.int32(k), low, scale)
+        starts.append(begin + np.arange(chunk, dtype=np.int32))
+        begin += chunk * count
+    kept = eqx.tree_at(lambda o: o.start, observations, jnp.asarray(np.concatenate(starts)))
+    return Samples(jnp.asarray(stored), low, scale, chunk), kept
+
+
+def observed_medium(scene: Scene, piece: Observations, samples: Samples | None) -> tuple[Medium, Rays]:
+    """What the rays of a piece march through, resampled anew or from kept samples, and the rays inside of it."""
+    rays, _ = enter(scene, piece.origin, piece.direction)
+    through = medium(scene)
+    if samples is not None:
+        through = through._replace(field=KeptField(samples.stored, piece.start, samples.low, samples.scale, samples.stride))
+    return through, rays
+
+
+@eqx.filter_jit
+def _longest(scene: Scene, piece: Observations, settings: Settings) -> Int[Array, ""]:
+    rays, _ = enter(scene, piece.origin, piece.direction)
+    return jnp.max(segment_count(rays.length, step_length(scene, settings)))
+
+
+@eqx.filter_jit
+def _resample(scene: Scene, piece: Observations, settings: Settings, k: Int[Array, ""], low: Array, scale: Array) -> Array:
+    rays, _ = enter(scene, piece.origin, piece.direction)
+    dt = step_length(scene, settings)
+    _, u = segment(k, segment_count(rays.length, dt), rays.length, dt)
+    s = jax.vmap(medium(scene).field.resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
+    return jnp.clip(jnp.round((s - low) / scale), 0, 65535).astype(jnp.uint16)
+
+
+def _check_weights(cameras: Sequence[AbstractCamera], weights: Sequence[Any] | None, dtype: Any) -> list[np.ndarray]:
+    if weights is None:
+        return [np.ones((camera.height, camera.width), dtype) for camera in cameras]
+    arrays = [np.asarray(weight, dtype) for weight in weights]
+    if len(arrays) != len(cameras):
+        raise ValueError(f"there are weights for {len(arrays)} images and {len(cameras)} cameras: give one array for each")
+    for i, (camera, weight) in enumerate(zip(cameras, arrays, strict=True)):
+        if weight.shape != (camera.height, camera.width) or not np.all(np.isfinite(weight) & (weight >= 0)):
+            raise ValueError(f"weights {i} must be {(camera.height, camera.width)}, finite and not negative; they have shape {weight.shape}")
+    return arrays

@@ -1,0 +1,154 @@
+"""The functions that solvers call, over the rays of one fit."""
+
+import functools
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jvr.fitting.identifiability import Determination, determination
+from jvr.fitting.losses import DSSIM, SquaredError
+from jvr.fitting.objective import Normal, Problem, image_value, normal_equations, prior_expansion, residual, value
+from jvr.fitting.observations import Observations, thin
+from jvr.fitting.solvers import Functions
+from jvr.model.camera import AbstractCamera
+from jvr.types import Scalar
+
+# The first level of a least-squares solver takes at most every so-manieth ray ...
+MOST_THINNING = 16
+# ... and at least so many residuals for each unknown.
+LEAST_RESIDUALS = 24
+
+
+class ValueFunction(eqx.Module):
+    """The objective as Optimistix calls it."""
+
+    problem: Problem
+    pieces: Observations
+    total: Scalar
+
+    def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Scalar, None]:
+        return value(self.problem, real, self.pieces, self.total), None
+
+
+class ImageValueFunction(eqx.Module):
+    """The objective of a loss over whole images."""
+
+    problem: Problem
+    cameras: tuple[AbstractCamera, ...]
+    images: tuple[Array, ...]
+
+    def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Scalar, None]:
+        return image_value(self.problem, real, self.cameras, self.images), None
+
+
+class ResidualFunction(eqx.Module):
+    """The whole residual vector, scaled to a squared length of the mean squared error; priors have no residuals."""
+
+    problem: Problem
+    pieces: Observations
+    total: Scalar
+
+    def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
+        model = self.problem.unknowns.model_from_real(self.problem.model, real)
+
+        def of_piece(piece: Observations) -> Array:
+            scale = jnp.sqrt(piece.weight / self.total)
+            return jnp.stack([scale * c for c in residual(self.problem, model, piece)])
+
+        return jnp.ravel(jax.lax.map(of_piece, self.pieces)), None
+
+
+class Work:
+    """A problem and its observations, ready for a solver; everything that is large lives here once."""
+
+    def __init__(self, problem: Problem, observations: Observations, chunk: int, cameras: Sequence[AbstractCamera], images: Any):
+        self.problem = problem
+        self.chunk = chunk
+        self.rays = observations.size
+        self.total = _total(observations)
+        self.levels = _levels(problem, observations, chunk)
+        self.functions = self._functions(observations, tuple(cameras), tuple(jnp.asarray(image) for image in images))
+
+    def expand(self, level: int, real: Float[Array, "unknowns"]) -> tuple[float, Normal]:
+        """The objective at `real`, over the rays of a level, and the normal equations in the unknowns' own values."""
+        values = self.problem.unknowns.values_from_real(jnp.asarray(real), self.problem.model)
+        observations = self.levels[level]
+        normal = self._sum(values, observations)
+        total = _total(observations)
+        prior, _, _ = prior_expansion(self.problem, values) if self.problem.priors else (0.0, None, None)
+        # Per residual, so that levels with different numbers of rays have the same scale.
+        normal = jax.tree.map(lambda x: x / total, normal)
+        return float(normal.loss) + float(prior), normal
+
+    def quadratic(self, real: np.ndarray, normal: Normal) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient and Gauss-Newton matrix of the objective on the real line."""
+        unknowns, model = self.problem.unknowns, self.problem.model
+        gradient, matrix = 2 * normal.vector, 2 * normal.matrix
+        if self.problem.priors:
+            _, prior_gradient, prior_matrix = prior_expansion(self.problem, unknowns.values_from_real(jnp.asarray(real), model))
+            gradient = gradient + np.asarray(prior_gradient, np.float64)
+            matrix = matrix + np.asarray(prior_matrix, np.float64)
+        slope = np.asarray(_slope(unknowns, model, jnp.asarray(real)), np.float64)
+        return slope.T @ gradient, slope.T @ matrix @ slope
+
+    def determination(self, values: Float[Array, "unknowns"]) -> Determination:
+        """Standard errors at the solution, over all rays."""
+        problem = self.problem
+        if isinstance(problem.loss, DSSIM):
+            # A loss over whole images has no residual variance: the errors are those that its solution has as least squares.
+            problem = eqx.tree_at(lambda p: p.loss, problem, SquaredError(), is_leaf=lambda x: isinstance(x, DSSIM))
+        normal = self._sum(values, self.levels[-1], problem)
+        measurements = 3 * int(jnp.sum(self.levels[-1].weight > 0))
+        return determination(normal.matrix, float(normal.squares), measurements)
+
+    def psnr(self, loss: float, normal: Normal | None) -> float:
+        """Decibels relative to radiance 1, from the mean squared error where it is known, else from the objective."""
+        mean = float(normal.squares) if normal is not None else loss
+        return float(-10 * np.log10(max(mean, 1e-20)))
+
+    def _sum(self, values: Float[Array, "unknowns"], observations: Observations, problem: Problem | None = None) -> Normal:
+        """Chunks are summed in float64: what float32 would round away is what small eigenvalues are made of."""
+        parts = [normal_equations(problem or self.problem, values, piece) for piece in observations.chunks(self.chunk)]
+        return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
+
+    def _functions(self, observations: Observations, cameras: tuple[AbstractCamera, ...], images: tuple[Array, ...]) -> Functions:
+        pieces = jax.tree.map(lambda x: x.reshape(-1, self.chunk, *x.shape[1:]), observations)
+        if isinstance(self.problem.loss, DSSIM):
+            function = ImageValueFunction(self.problem, cameras, images)
+        else:
+            function = ValueFunction(self.problem, pieces, jnp.asarray(self.total))
+        residuals = ResidualFunction(self.problem, pieces, jnp.asarray(self.total))
+        levels = tuple(functools.partial(self.expand, i) for i in range(len(self.levels)))
+        reach = self.problem.unknowns.reach(self.problem.model)
+        return Functions(function, residuals, levels, reach, self.quadratic)
+
+
+def fingerprint(problem: Problem, observations: Observations, solver: Any) -> str:
+    """A digest of everything that a fit depends on, so that a checkpoint is not taken up by another one."""
+    digest = hashlib.sha256(repr((jax.tree.structure(problem), solver)).encode())
+    for leaf in jax.tree.leaves((problem.model, observations)):
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def _total(observations: Observations) -> float:
+    """Weighted number of residuals."""
+    return max(3 * float(jnp.sum(observations.weight)), np.finfo(np.float32).tiny)
+
+
+def _levels(problem: Problem, observations: Observations, chunk: int) -> tuple[Observations, ...]:
+    """All observations, after a subset that still over-determines the unknowns where that is much smaller."""
+    unknowns = sum(v.size for v in problem.unknowns.values(problem.model))
+    every = min(MOST_THINNING, 3 * observations.size // max(LEAST_RESIDUALS * unknowns, chunk))
+    return (observations,) if every < 2 else (thin(observations, every, chunk), observations)
+
+
+@eqx.filter_jit
+def _slope(unknowns: Any, model: Any, real: Array) -> Array:
+    return jax.jacfwd(lambda r: unknowns.values_from_real(r, model))(real)

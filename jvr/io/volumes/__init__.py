@@ -1,0 +1,137 @@
+"""Reading volumes: one function for every format, one line of explanation for every file that cannot be read.
+
+`read_volume` looks at the name, calls the reader of that format and makes a `Volume` of what it found. Nothing heavy is
+imported before a file asks for it.
+"""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jvr.io.volumes.arrays import read_npy, read_raw, read_zarr
+from jvr.io.volumes.dicom import read_dicom_file, read_dicom_folder
+from jvr.io.volumes.errors import VolumeError, first_bytes
+from jvr.io.volumes.itk import read_metaimage, read_nrrd
+from jvr.io.volumes.nifti import read_nifti
+from jvr.io.volumes.stored import Stored, replaced_grid, to_volume
+from jvr.io.volumes.tiff import read_tiff
+from jvr.io.volumes.vtk_files import read_legacy_vtk, read_vti
+from jvr.model.volume import Volume
+
+__all__ = ["VolumeError", "read_volume"]
+
+Numbers = float | int | Sequence[float | int] | np.ndarray
+
+RAW = (".raw", ".bin", ".dat")
+# For each ending: the reader and the keywords of `read_volume` that it takes.
+READERS: dict[str, tuple[Callable[..., Stored], tuple[str, ...]]] = {
+    ".mhd": (read_metaimage, ()),
+    ".mha": (read_metaimage, ()),
+    ".nrrd": (read_nrrd, ()),
+    ".nhdr": (read_nrrd, ()),
+    ".nii": (read_nifti, ()),
+    ".nii.gz": (read_nifti, ()),
+    ".dcm": (read_dicom_file, ()),
+    ".vtk": (read_legacy_vtk, ("array",)),
+    ".vti": (read_vti, ("array",)),
+    ".tif": (read_tiff, ()),
+    ".tiff": (read_tiff, ()),
+    ".npy": (read_npy, ("axes",)),
+    ".zarr": (read_zarr, ("array", "axes")),
+} | {ending: (read_raw, ("shape", "dtype")) for ending in RAW}
+MEANING = {
+    "shape": "shape= and dtype= describe headerless raw files, this file has a header",
+    "dtype": "shape= and dtype= describe headerless raw files, this file has a header",
+    "array": "array= names an array in a .vtk, .vti or .zarr, this file holds a single one",
+    "series": "series= chooses among the DICOM series of a folder",
+    "axes": "axes= orders the axes of .npy and .zarr, this format defines its own",
+}
+
+
+def read_volume(
+    path: str | os.PathLike,
+    *,
+    shape: Sequence[int] | None = None,
+    dtype: Any = None,
+    spacing: Numbers | None = None,
+    origin: Numbers | None = None,
+    array: str | None = None,
+    series: str | None = None,
+    axes: str | None = None,
+    nan_value: float | int | None = None,
+) -> Volume:
+    """Reads a scalar volume and where it lies in the world (millimetres, LPS, as ITK reads it).
+
+    Formats: MetaImage (.mhd, .mha), NRRD (.nrrd, .nhdr), NIfTI (.nii, .nii.gz), a folder of DICOM slices or one .dcm,
+    legacy VTK structured points (.vtk), VTK image data (.vti), TIFF stacks (.tif, .tiff), NumPy (.npy, never unpickled),
+    Zarr (.zarr) and headerless raw (.raw, .bin, .dat, or any ending where `shape` and `dtype` are given).
+
+    Integer voxels stay integers (32 and 64-bit ones as narrow as their values fit), floats become float32 unless x64 is
+    on. A file's slope and intercept become those of the `Volume`, or are applied where its reader does so (DICOM).
+    A 2-D image becomes one voxel thick.
+
+    **Arguments:**
+
+    - `path`: the file, or the folder of a DICOM series or a Zarr.
+    - `shape`, `dtype`: voxels along x, y, z (x fastest in the file) and NumPy type of a headerless file; ">i2" is big-endian.
+    - `spacing`: millimetres between voxels along x, y, z, or one number for all, in place of what the file says (default 1).
+    - `origin`: world position of voxel (0, 0, 0) in mm, in place of what the file says (default 0, 0, 0).
+    - `array`: which array of a VTK file or Zarr group.
+    - `series`: which DICOM series of a folder, by its id.
+    - `axes`: the order of a NumPy or Zarr array's axes, such as "zyx"; default "xyz", or what a Zarr's metadata say.
+    - `nan_value`: number, in data units, that takes the place of NaN and infinite voxels.
+
+    **Raises** `VolumeError` (a `ValueError`) with one line that names the file, what is wrong and what would be right, for
+    anything that is not a whole, finite, scalar volume on a regular grid, and the system's own `OSError` (such as
+    `FileNotFoundError`) where a file cannot be opened. Warns where float32 loses what sets float64 voxels apart.
+    """
+    path = Path(path).expanduser()
+    spacing_mm = _three(path, "spacing", [spacing] * 3 if isinstance(spacing, int | float) else spacing, positive=True)
+    origin_mm = _three(path, "origin", origin, positive=False)
+    if nan_value is not None and not math.isfinite(nan_value):
+        raise VolumeError(path, f"nan_value={nan_value} must be a finite number")
+    given = {"shape": shape, "dtype": dtype, "array": array, "series": series, "axes": axes}
+    reader, takes = _reader(path, raw=shape is not None and dtype is not None)
+    if superfluous := [key for key, value in given.items() if value is not None and key not in takes]:
+        raise VolumeError(path, f"{MEANING[superfluous[0]]}: leave {superfluous[0]}= out")
+    stored = reader(path, *[given[key] if key != "axes" or reader is read_zarr else axes or "xyz" for key in takes])
+    stored.world_from_grid = replaced_grid(stored.world_from_grid, spacing_mm, origin_mm)
+    return to_volume(path, stored, nan_value)
+
+
+def _three(path: Path, name: str, numbers: Any, *, positive: bool) -> np.ndarray | None:
+    """Three numbers of a keyword as an array."""
+    if numbers is None:
+        return None
+    try:
+        values = np.asarray(numbers, float)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (3,) or not np.isfinite(values).all() or (positive and not (values > 0).all()):
+        wanted = "three positive finite numbers" if positive else "three finite numbers"
+        raise VolumeError(path, f"{name}={numbers} must be {wanted}, in mm along x, y, z")
+    return values
+
+
+def _reader(path: Path, *, raw: bool) -> tuple[Callable[..., Stored], tuple[str, ...]]:
+    """The reader for a name, and the keywords it takes."""
+    name = path.name.lower()
+    ending = next((ending for ending in (".nii.gz", path.suffix.lower()) if name.endswith(ending) and ending in READERS), None)
+    if path.is_dir():
+        is_zarr = ending == ".zarr" or any((path / marker).exists() for marker in ("zarr.json", ".zarray", ".zgroup"))
+        return READERS[".zarr"] if is_zarr else (read_dicom_folder, ("series",))
+    first_bytes(path, 1)
+    if ending == ".zarr":
+        raise VolumeError(path, "a Zarr is a folder, this is a file; unpack it first")
+    if ending is not None:
+        return READERS[ending]
+    if raw:
+        return read_raw, ("shape", "dtype")
+    shown = "".join(path.suffixes[-2:]) if name.endswith(".gz") else path.suffix
+    known = ", ".join(ending for ending in READERS)
+    problem = f"unsupported extension '{shown}'; supported: {known}, a folder of DICOM slices"
+    raise VolumeError(path, f"{problem}, and headerless data of any extension with shape= and dtype=")

@@ -1,0 +1,217 @@
+"""Every way to differentiate a rendering against every other, and against central differences, for every kind of parameter."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import OBLIQUE, gaussian_transfer, linear_transfer, lut_transfer, perspective, voxels
+
+import jvr
+from jvr.rendering.image import trace
+
+WIDTH, HEIGHT = 5, 4
+
+# Compiling is what takes the time here, and what is compared does not depend on the compiler's effort.
+compiled = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+
+# Central differences: h^2 and the rounding of a loss near 10 divided by h leave about 1e-8. Between two ways: rounding alone.
+DIFFERENCES, ROUNDING = 1e-6, 1e-11
+
+TRANSFERS = {
+    "linear": lambda: linear_transfer(),
+    "linear, coloured": lambda: linear_transfer(coloured=True),
+    "table": lambda: lut_transfer(),
+    "table, coloured": lambda: lut_transfer(coloured=True),
+    "Gaussians": lambda: gaussian_transfer(),
+    "Gaussians, coloured": lambda: gaussian_transfer(coloured=True),
+}
+
+
+def parameters(transfer, clipped=False, parallel=False):
+    """Every kind of array that a picture depends on."""
+    volume = jvr.Volume(voxels((3, 4, 5)), OBLIQUE)
+    center, radius = volume.center, volume.radius
+    p = {
+        "transfer": transfer,
+        "voxels": volume.values,
+        "slope": jnp.array(0.9),
+        "intercept": jnp.array(0.05),
+        "world_from_grid": volume.world_from_grid,
+        "eye": center + radius * jnp.array([1.8, -1.1, 0.9]),
+        "target": center + 0.1,
+        "up": jnp.array([0.1, 0.2, 1.0]),
+        "extent": 1.9 * radius if parallel else jnp.array(42.0),
+        "background": jnp.array([0.2, 0.5, 0.9]),
+    }
+    if clipped:
+        p["clipping"] = jvr.ClippingBox(center - jnp.array([1.1, 1.9, 1.3]), center + jnp.array([1.2, 1.4, 2.1]))
+    return p
+
+
+def picture(p, settings, parallel=False, optical=jvr.EmissionAbsorption()):
+    volume = jvr.Volume(p["voxels"], p["world_from_grid"], slope=p["slope"], intercept=p["intercept"])
+    kind = jvr.OrthographicCamera if parallel else jvr.PerspectiveCamera
+    camera = kind.look_at(p["eye"], p["target"], p["up"], p["extent"], WIDTH, HEIGHT)
+    scene = jvr.Scene(volume, p["transfer"], background=p["background"], clipping=p.get("clipping"), optical=optical)
+    return jvr.render(scene, camera, settings)
+
+
+def make_loss(fixed, adjoint, tile=100, **options):
+    """The loss as a function of some parameters, the others being `fixed`: it touches every pixel of colour, opacity and depth, each with
+    its own weight."""
+    settings = jvr.Settings(0.7, termination=0, adjoint=adjoint, tile=tile)
+
+    def loss(p):
+        image = picture(fixed | p, settings, **options)
+        wave = lambda x: jnp.sin(jnp.arange(1.0, x.size + 1)).reshape(x.shape)
+        return jnp.sum(wave(image.rgb) * image.rgb**2) + jnp.sum(wave(image.alpha) * image.alpha) + jnp.sum(jnp.cos(image.depth))
+
+    return loss
+
+
+def central_differences(loss, p, h=1e-6):
+    """The gradient of `loss` in every entry of `p`."""
+    leaves, structure = jax.tree.flatten(p)
+    ends = np.cumsum([x.size for x in leaves])[:-1]
+    flat = np.concatenate([np.ravel(x) for x in leaves])
+    split = lambda v: jax.tree.unflatten(structure, [a.reshape(x.shape) for a, x in zip(jnp.split(v, ends), leaves, strict=True)])
+    moved = np.concatenate([flat + h * np.eye(flat.size), flat - h * np.eye(flat.size)])
+    above, below = jnp.split(compiled(lambda v: jax.lax.map(lambda x: loss(split(x)), v, batch_size=64))(moved), 2)
+    return split((above - below) / (2 * h))
+
+
+def agree(one, other, tolerance):
+    """Each array to `tolerance` of its largest entry; none of them is zero. The last row of an affine transform is no parameter."""
+    for (path, b), a in zip(jax.tree_util.tree_leaves_with_path(other), jax.tree.leaves(one), strict=True):
+        name = jax.tree_util.keystr(path)
+        a, b = (a[:3], b[:3]) if "world_from_grid" in name else (a, b)
+        scale = np.abs(b).max()
+        assert scale > 0, name
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * scale, err_msg=name)
+
+
+def check_every_way(p, names, rows=True, **options):
+    """All ways for the parameters called `names`."""
+    fixed, moving = {k: v for k, v in p.items() if k not in names}, {k: p[k] for k in names}
+    replay = compiled(jax.grad(make_loss(fixed, jvr.Replay(), **options)))(moving)
+    agree(replay, central_differences(make_loss(fixed, jvr.Forward(), **options), moving), DIFFERENCES)
+    agree(compiled(jax.jacfwd(make_loss(fixed, jvr.Forward(), **options)))(moving), replay, ROUNDING)
+    if rows:
+        for transform in (jax.jacfwd, jax.grad):
+            agree(compiled(transform(make_loss(fixed, jvr.Rows(), **options)))(moving), replay, ROUNDING)
+
+
+def test_every_parameter_at_once(x64):
+    p = parameters(TRANSFERS["linear"]())
+    check_every_way(p, tuple(p))
+
+
+@pytest.mark.parametrize("kind", ["linear, coloured", "table", "Gaussians, coloured"])
+def test_transfer_functions(kind, x64):
+    check_every_way(parameters(TRANSFERS[kind]()), ("transfer", "intercept"))
+
+
+@pytest.mark.parametrize("optical", [jvr.EmissionOnly(), jvr.AbsorptionOnly()], ids=["emission", "absorption"])
+def test_optical_models(optical, x64):
+    p = parameters(TRANSFERS["table, coloured"]())
+    names = ("transfer", "eye") if isinstance(optical, jvr.EmissionOnly) else ("voxels", "eye")
+    check_every_way(p, names, rows=False, optical=optical)
+
+
+def test_entry_and_exit_through_a_clipping_box(x64):
+    p = parameters(TRANSFERS["Gaussians"](), clipped=True, parallel=True)
+    check_every_way(p, ("clipping", "eye", "extent"), parallel=True)
+
+
+def test_tiles_and_no_jit(x64):
+    """Gradients that add up over tiles which do not divide the picture; without `jit` the same."""
+    p = parameters(TRANSFERS["linear"]())
+    fixed, moving = {k: v for k, v in p.items() if k != "transfer"}, {"transfer": p["transfer"]}
+    whole = compiled(jax.grad(make_loss(fixed, jvr.Replay())))(moving)
+    agree(compiled(jax.grad(make_loss(fixed, jvr.Replay(), tile=7)))(moving), whole, ROUNDING)
+    agree(compiled(jax.jacfwd(make_loss(fixed, jvr.Forward(), tile=7)))(moving), whole, ROUNDING)
+    agree(jax.grad(make_loss(fixed, jvr.Replay()))(moving), whole, ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("transform", "adjoint"),
+    [(jax.grad, jvr.Replay()), (jax.jacfwd, jvr.Forward()), (jax.grad, jvr.Rows()), (jax.jacfwd, jvr.Rows())],
+    ids=["replay", "forward", "rows, reverse", "rows, forward"],
+)
+def test_vmapped(transform, adjoint, x64):
+    """A batch of gradients is each gradient by itself. The batch differs in a perturbed and in a fixed array."""
+    p = parameters(TRANSFERS["linear"]())
+    fixed = {k: v for k, v in p.items() if k not in ("transfer", "eye")}
+    gradient = lambda transfer, eye: transform(make_loss(fixed | {"eye": eye}, adjoint))({"transfer": transfer})
+    transfers = [linear_transfer(seed=seed) for seed in (1, 5)]
+    eyes = jnp.stack([p["eye"], p["eye"] + jnp.array([0.5, 1.0, -0.7])])
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *transfers)
+    batch = compiled(jax.vmap(gradient))(stacked, eyes)
+    alone = jax.lax.map(lambda x: gradient(*x), (stacked, eyes))
+    agree(batch, alone, ROUNDING)
+
+
+@pytest.mark.parametrize(("kind", "termination"), [("linear", 0.2), ("table, coloured", 0.0), ("linear, coloured", 0.2)])
+def test_rows_of_a_table(kind, termination, x64):
+    """Without distances, rows of a table come out of one replay with hat functions."""
+    p = parameters(TRANSFERS[kind]())
+    volume = jvr.Volume(p["voxels"], p["world_from_grid"])
+    camera = jvr.PerspectiveCamera.look_at(p["eye"], p["target"], p["up"], p["extent"], WIDTH, HEIGHT)
+    pixels = jnp.arange(WIDTH * HEIGHT)
+
+    def gathered(adjoint):
+        settings = jvr.Settings(0.7, termination=termination, adjoint=adjoint)
+
+        def of(entries):
+            transfer = jax.tree.map(lambda x: x, p["transfer"])
+            object.__setattr__(transfer, "rgb", entries["rgb"])
+            object.__setattr__(transfer, "sigma_t", entries["sigma_t"])
+            marched = trace(jvr.Scene(volume, transfer), camera, settings, pixels, distance=False)[0]
+            return {"radiance": marched.radiance, "tau": marched.tau}
+
+        return of
+
+    entries = {"rgb": p["transfer"].rgb, "sigma_t": 4 * p["transfer"].sigma_t}
+    expected = compiled(jax.jacfwd(gathered(jvr.Forward())))(entries)
+    forward = compiled(jax.jacfwd(gathered(jvr.Rows())))(entries)
+    reverse = compiled(jax.jacrev(gathered(jvr.Rows())))(entries)
+    replayed = compiled(jax.jacrev(gathered(jvr.Replay())))(entries)
+    for other in (forward, reverse, replayed):
+        assert jax.tree.structure(other) == jax.tree.structure(expected)
+        for a, b in zip(jax.tree.leaves(other), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
+    assert max(np.abs(x).max() for x in jax.tree.leaves(expected)) > 0.1
+
+
+def test_modes_that_a_way_does_not_have_are_refused(x64):
+    p = parameters(TRANSFERS["linear"]())
+    moving = {"background": p["background"], "transfer": p["transfer"]}
+    with pytest.raises(TypeError, match="forward-mode"):
+        jax.jacfwd(make_loss(p, jvr.Replay()))(moving)
+    with pytest.raises(ValueError, match="[Rr]everse-mode"):
+        jax.grad(make_loss(p, jvr.Forward()))(moving)
+
+
+@pytest.mark.parametrize("unknown", ["transfer", "voxels"])
+def test_memory_of_a_gradient_does_not_grow_with_the_steps(unknown):
+    """Temporary memory of the compiled gradient: 300 bytes a ray and two volumes, whatever the step."""
+    size, n = 64, 24
+    volume = jvr.Volume(voxels((n, n, n)))
+    camera = perspective(volume, size, size)
+    moving = {"transfer": linear_transfer(), "voxels": volume.values}
+
+    def temporary(step):
+        settings = jvr.Settings(step)
+
+        def loss(x):
+            all_ = moving | {unknown: x}
+            image = jvr.render(jvr.Scene(jvr.Volume(all_["voxels"]), all_["transfer"]), camera, settings)
+            return jnp.sum(image.rgb**2)
+
+        return jax.jit(jax.value_and_grad(loss)).lower(moving[unknown]).compile().memory_analysis().temp_size_in_bytes
+
+    coarse, fine = temporary(0.5), temporary(0.03)
+    assert abs(fine - coarse) <= 0.05 * coarse
+    assert fine <= 300 * size * size + 2 * volume.values.nbytes
