@@ -52,6 +52,8 @@ if TYPE_CHECKING:
     from jvr.fitting.unknowns import Softplus as Softplus
     from jvr.io.volumes import read_volume as read_volume
 
+__version__ = "0.1.0"
+
 # Fitting alone takes longer to import than JAX, so it and the readers are imported by their first use.
 _LATE = {
     "jvr.fitting.fit": ("FitResult", "fit"),

@@ -208,8 +208,14 @@ def _check(problem: Problem, solver: AbstractSolver) -> None:
         isinstance(solver, OptimistixSolver) and isinstance(solver.solver, optx.AbstractLeastSquaresSolver)
     )
     if is_least_squares and isinstance(problem.loss, DSSIM):
-        raise ValueError("DSSIM is not a sum over pixels and has no least-squares form: use solver=optimistix.BFGS(rtol=1e-6, atol=1e-8)")
-    if isinstance(solver, OptimistixSolver) and is_least_squares and not (type(problem.loss) is SquaredError and not problem.priors):
+        raise ValueError(
+            "DSSIM is not a sum over pixels and has no least-squares form: use solver=optimistix.BFGS(rtol=1e-6, atol=1e-8)"
+        )
+    if (
+        isinstance(solver, OptimistixSolver)
+        and is_least_squares
+        and not (type(problem.loss) is SquaredError and not problem.priors)
+    ):
         raise ValueError("Optimistix's least-squares solvers take squared errors without priors: use jvr.LevenbergMarquardt()")
     inner = march_unknowns(problem)
     if is_least_squares and inner > MOST_FORWARD:
@@ -252,7 +258,9 @@ def _compare(problem: Problem, found: Exposed, cameras: Sequence[AbstractCamera]
 
     scores = []
     for camera, target in zip(cameras, check_images(cameras, images, "held-out image"), strict=True):
-        gathered, rays, _ = trace(found.scene, camera, problem.settings, jnp.arange(camera.width * camera.height, dtype=jnp.int32))
+        gathered, rays, _ = trace(
+            found.scene, camera, problem.settings, jnp.arange(camera.width * camera.height, dtype=jnp.int32)
+        )
         rendered = np.stack(predict(problem, found, gathered, rays.length), axis=-1).reshape(target.shape)
         psnr = peak_signal_noise_ratio(target, rendered, data_range=1.0)
         window = min(7, *target.shape[:2]) // 2 * 2 - 1 if min(target.shape[:2]) < 7 else 7

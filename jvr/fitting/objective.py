@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior
 from jvr.fitting.observations import Observations, Samples, observed_medium
 from jvr.fitting.unknowns import Exposed, Unknowns
-from jvr.march.differentiation import Forward, Replay
+from jvr.march.differentiation import AbstractAdjoint, Forward, Replay
 from jvr.march.march import Marched, MarchOptions
 from jvr.march.rows import TableRows, table_rows
 from jvr.model.camera import AbstractCamera
@@ -73,11 +73,11 @@ def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations
     return loss / total + prior(problem, model)
 
 
-def residual(problem: Problem, model: Exposed, piece: Observations) -> Triple:
-    """Rendered minus target in each channel; reverse mode."""
+def residual(problem: Problem, model: Exposed, piece: Observations, adjoint: AbstractAdjoint = Replay()) -> Triple:
+    """Rendered minus target in each channel, differentiable in the mode of `adjoint`."""
     medium, rays = observed_medium(model.scene, piece, problem.samples)
     options = MarchOptions(problem.settings.termination, distance=False)
-    gathered = Replay().march(options, medium, rays, step_length(model.scene, problem.settings))
+    gathered = adjoint.march(options, medium, rays, step_length(model.scene, problem.settings))
     colours = predict(problem, model, gathered, rays.length)
     return tuple(c - piece.target[:, i] for i, c in enumerate(colours))
 
@@ -99,7 +99,7 @@ def image_value(
 
 def prior(problem: Problem, model: Exposed) -> Scalar | float:
     """The sum of all priors."""
-    return sum(p.value(model.scene) for p in problem.priors)
+    return sum((p.value(model.scene) for p in problem.priors), 0.0)
 
 
 @eqx.filter_jit

@@ -61,14 +61,18 @@ def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "ta
     """
     images = [np.asarray(image, dtype=np.float32 if not jax.config.jax_enable_x64 else np.float64) for image in images]
     if len(images) != len(cameras) or not images:
-        raise ValueError(f"there are {len(images)} images for {len(cameras)} cameras: give one image for each camera, and at least one")
+        raise ValueError(
+            f"there are {len(images)} images for {len(cameras)} cameras: give one image for each camera, and at least one"
+        )
     for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
         if image.shape != (camera.height, camera.width, 3):
             raise ValueError(
                 f"{name} {i} has shape {image.shape}, its camera sees {(camera.height, camera.width, 3)}: resize the image or the camera"
             )
         if not np.all(np.isfinite(image)):
-            raise ValueError(f"{name} {i} has {np.sum(~np.isfinite(image))} values that are not finite: give them weight 0 and replace them")
+            raise ValueError(
+                f"{name} {i} has {np.sum(~np.isfinite(image))} values that are not finite: give them weight 0 and replace them"
+            )
     return images
 
 
@@ -163,5 +167,7 @@ def _check_weights(cameras: Sequence[AbstractCamera], weights: Sequence[Any] | N
         raise ValueError(f"there are weights for {len(arrays)} images and {len(cameras)} cameras: give one array for each")
     for i, (camera, weight) in enumerate(zip(cameras, arrays, strict=True)):
         if weight.shape != (camera.height, camera.width) or not np.all(np.isfinite(weight) & (weight >= 0)):
-            raise ValueError(f"weights {i} must be {(camera.height, camera.width)}, finite and not negative; they have shape {weight.shape}")
+            raise ValueError(
+                f"weights {i} must be {(camera.height, camera.width)}, finite and not negative; they have shape {weight.shape}"
+            )
     return arrays

@@ -104,9 +104,9 @@ class ChunkedLeastSquares(AbstractSolver):
         scale = 1 / np.sqrt(np.maximum(diagonal, FLOOR * diagonal.max(initial=TINY)))
         # A ridge far under the rounding of the sums keeps the factorisation alive in directions that no ray sees.
         scaled = scale[:, None] * matrix * scale + 1e-9 * np.eye(len(scale))
-        model = (float(state.loss), scale * gradient, scaled)
+        model = (state.loss, scale * gradient, scaled)
         with jax.enable_x64(True):
-            move = np.asarray(_descend(self.descent, *model, float(state.step_size)))
+            move = np.asarray(_descend(self.descent, *model, state.step_size))
         # Beyond its reach a transform has bent so far that the quadratic model says nothing: a saturated unknown would jump there.
         reach = functions.reach / scale
         move = np.clip(np.where(np.isfinite(move), move, 0.0), -reach, reach)
@@ -114,7 +114,7 @@ class ChunkedLeastSquares(AbstractSolver):
         loss, normal = functions.levels[int(state.level)](jnp.asarray(trial))
         finite = np.isfinite(loss) and all(np.all(np.isfinite(x)) for x in normal)
         with jax.enable_x64(True):
-            step_size, accept = _search(self.search, *model, move, loss if finite else np.inf, float(state.step_size))
+            step_size, accept = _search(self.search, *model, move, np.asarray(loss if finite else np.inf), state.step_size)
         if accept:
             return self._accepted(functions, state, trial, loss, normal, step_size)
         state = state._replace(step_size=np.asarray(step_size), rejections=state.rejections + 1)
@@ -146,6 +146,7 @@ class ChunkedLeastSquares(AbstractSolver):
 
 
 def _state(*fields: Any) -> ChunkedState:
+    # Arrays all through: a Python number would be compiled in, and each step would compile anew.
     return ChunkedState(*jax.tree.map(np.asarray, fields))
 
 
@@ -189,37 +190,74 @@ def Dogleg(rtol: float = 1e-3) -> ChunkedLeastSquares:
     return ChunkedLeastSquares(optx.DoglegDescent(), optx.ClassicalTrustRegion(), rtol)
 
 
-class OptimistixState(NamedTuple):
-    """`inner` is Optimistix's own state; `best` and `best_loss` the best point it has accepted."""
+class Scaled(eqx.Module):
+    """An objective times a factor. Quasi-Newton methods leave out updates whose curvature is under the rounding of float32, which a
+    mean over pixels starts out with; scaled by `unknowns / objective` at the start, a step of one changes it by about itself."""
+
+    function: eqx.Module
+    factor: Array
+
+    def __call__(self, real: Float[Array, "n"], args: None) -> tuple[Array, None]:
+        loss, aux = self.function(real, args)
+        return loss * self.factor, aux
+
+
+@eqx.filter_jit
+def _factor(function: Any, real: Array) -> Array:
+    loss, _ = function(real, None)
+    return jnp.where(loss > 0, real.size / jnp.where(loss > 0, loss, 1.0), 1.0)
+
+
+class GradientState(NamedTuple):
+    """`inner` is the other library's state; `best` and `best_loss` the best point it has accepted; `factor` that of `Scaled`."""
 
     real: Array
     inner: Any
     best: Array
     best_loss: Array
+    factor: Array
     done: Array
 
 
-class OptimistixSolver(AbstractSolver):
+class AbstractGradientSolver(AbstractSolver):
+    """A solver of another library; keeps the best point that it has accepted."""
+
+    def iterate(self, state: GradientState) -> tuple[np.ndarray, float]:
+        return np.asarray(state.best), float(state.best_loss / state.factor)
+
+    def outcome(self, state: GradientState) -> Outcome | None:
+        return (None, Outcome.CONVERGED, Outcome.NON_FINITE)[int(state.done)]
+
+
+def _moved(state: GradientState, real: Array, inner: Any, here: Array, loss: Array, finished: Array) -> GradientState:
+    """The state after a step that ended at `real` and knows the objective `loss` at `here`."""
+    finite = jnp.all(jnp.isfinite(real)) & jnp.isfinite(loss)
+    better = finite & (loss < state.best_loss)
+    best, best_loss = jnp.where(better, here, state.best), jnp.where(better, loss, state.best_loss)
+    return GradientState(real, inner, best, best_loss, state.factor, jnp.where(finite, finished.astype(int), 2))
+
+
+def _begin(real: Array, inner: Any, factor: Array) -> GradientState:
+    return GradientState(real, inner, real, jnp.asarray(jnp.inf, real.dtype), factor, jnp.asarray(0))
+
+
+class OptimistixSolver(AbstractGradientSolver):
     """Drives a minimiser of Optimistix (BFGS, LBFGS, OptaxMinimiser, ...) over the value, or a least-squares solver over the whole
     residual vector, which must then fit in memory, times the number of unknowns."""
 
     solver: optx.AbstractMinimiser | optx.AbstractLeastSquaresSolver
 
-    def init(self, functions: Functions, real: Float[Array, "n"]) -> OptimistixState:
-        inner = _init(self.solver, self._function(functions), real)
-        return OptimistixState(real, inner, real, jnp.asarray(jnp.inf, real.dtype), jnp.asarray(0))
+    def init(self, functions: Functions, real: Float[Array, "n"]) -> GradientState:
+        whole = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
+        factor = jnp.ones(()) if whole else _factor(functions.value, real)
+        return _begin(real, _init(self.solver, self._function(functions, factor), real), factor)
 
-    def step(self, functions: Functions, state: OptimistixState) -> OptimistixState:
-        return _step(self.solver, self._function(functions), state)
+    def step(self, functions: Functions, state: GradientState) -> GradientState:
+        return _step(self.solver, self._function(functions, state.factor), state)
 
-    def iterate(self, state: OptimistixState) -> tuple[np.ndarray, float]:
-        return np.asarray(state.best), float(state.best_loss)
-
-    def outcome(self, state: OptimistixState) -> Outcome | None:
-        return (None, Outcome.CONVERGED, Outcome.NON_FINITE)[int(state.done)]
-
-    def _function(self, functions: Functions) -> eqx.Module:
-        return functions.residuals if isinstance(self.solver, optx.AbstractLeastSquaresSolver) else functions.value
+    def _function(self, functions: Functions, factor: Array) -> eqx.Module:
+        whole = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
+        return functions.residuals if whole else Scaled(functions.value, factor)
 
 
 @eqx.filter_jit
@@ -229,32 +267,18 @@ def _init(solver: Any, fn: Any, real: Array) -> Any:
 
 
 @eqx.filter_jit
-def _step(solver: Any, fn: Any, state: OptimistixState) -> OptimistixState:
+def _step(solver: Any, fn: Any, state: GradientState) -> GradientState:
     real, inner, _ = solver.step(fn, state.real, None, {}, state.inner, frozenset())
     finished, _ = solver.terminate(fn, real, None, {}, inner, frozenset())
     if isinstance(solver, optx.OptaxMinimiser):
         # Optax moves on from the point that it has just evaluated; the others return the point that they have accepted.
-        here, loss = state.real, inner.f
-    else:
-        # Least-squares solvers minimise half the squared length.
-        here, loss = real, inner.f_info.as_min() * (2 if isinstance(solver, optx.AbstractLeastSquaresSolver) else 1)
-    better = loss < state.best_loss
-    best, best_loss = jnp.where(better, here, state.best), jnp.where(better, loss, state.best_loss)
-    finite = jnp.all(jnp.isfinite(real)) & jnp.isfinite(loss)
-    return OptimistixState(real, inner, best, best_loss, jnp.where(finite, finished.astype(int), 2))
+        return _moved(state, real, inner, state.real, inner.f, finished)
+    # Least-squares solvers minimise half the squared length.
+    half = isinstance(solver, optx.AbstractLeastSquaresSolver)
+    return _moved(state, real, inner, real, inner.f_info.as_min() * (2 if half else 1), finished)
 
 
-class BoundedState(NamedTuple):
-    """`inner` is jaxopt's state; `real` the values themselves."""
-
-    real: Array
-    inner: Any
-    best: Array
-    best_loss: Array
-    done: Array
-
-
-class LBFGSB(AbstractSolver):
+class LBFGSB(AbstractGradientSolver):
     """Limited-memory BFGS with bounds (Byrd et al. 1995), by jaxopt, over the values themselves: no transform stands between.
 
     **Arguments:** `lower`, `upper`: bounds for all unknowns alike, or one of each for every unknown, flat; `tol`: of the projected
@@ -266,25 +290,14 @@ class LBFGSB(AbstractSolver):
     tol: float = eqx.field(static=True, default=1e-6)
     history: int = eqx.field(static=True, default=10)
 
-    def init(self, functions: Functions, real: Float[Array, "n"]) -> BoundedState:
+    def init(self, functions: Functions, real: Float[Array, "n"]) -> GradientState:
         bounds = self._bounds(real)
         real = jnp.clip(real, *bounds)
-        inner = _bounded_init(self.tol, self.history, functions.value, real, bounds)
-        return BoundedState(real, inner, real, jnp.asarray(jnp.inf, real.dtype), jnp.asarray(0))
+        factor = _factor(functions.value, real)
+        return _begin(real, _bounded_init(self.tol, self.history, Scaled(functions.value, factor), real, bounds), factor)
 
-    def step(self, functions: Functions, state: BoundedState) -> BoundedState:
-        real, inner = _bounded_step(self.tol, self.history, functions.value, state.real, state.inner, self._bounds(state.real))
-        finite = jnp.all(jnp.isfinite(real)) & jnp.isfinite(inner.value)
-        better = finite & (inner.value < state.best_loss)
-        best, best_loss = jnp.where(better, real, state.best), jnp.where(better, inner.value, state.best_loss)
-        done = jnp.where(finite, (inner.error <= self.tol).astype(int), 2)
-        return BoundedState(real, inner, best, best_loss, done)
-
-    def iterate(self, state: BoundedState) -> tuple[np.ndarray, float]:
-        return np.asarray(state.best), float(state.best_loss)
-
-    def outcome(self, state: BoundedState) -> Outcome | None:
-        return (None, Outcome.CONVERGED, Outcome.NON_FINITE)[int(state.done)]
+    def step(self, functions: Functions, state: GradientState) -> GradientState:
+        return _bounded_step(self.tol, self.history, Scaled(functions.value, state.factor), state, self._bounds(state.real))
 
     def _bounds(self, real: Array) -> tuple[Array, Array]:
         return tuple(jnp.broadcast_to(jnp.asarray(b, real.dtype), real.shape) for b in (self.lower, self.upper))
@@ -295,7 +308,7 @@ def _jaxopt_solver(tol: float, history: int, fn: Any) -> Any:
         # jaxopt announces on import that it is no longer maintained; users of one bounded fit cannot act on that.
         warnings.simplefilter("ignore")
         import jaxopt
-    return jaxopt.LBFGSB(lambda real: fn(real, None)[0], tol=tol, history_size=history, jit=False)
+    return jaxopt.LBFGSB(lambda real: fn(real, None)[0], tol=tol, history_size=history)
 
 
 @eqx.filter_jit
@@ -304,5 +317,6 @@ def _bounded_init(tol: float, history: int, fn: Any, real: Array, bounds: tuple[
 
 
 @eqx.filter_jit
-def _bounded_step(tol: float, history: int, fn: Any, real: Array, inner: Any, bounds: tuple[Array, Array]) -> Any:
-    return _jaxopt_solver(tol, history, fn).update(real, inner, bounds)
+def _bounded_step(tol: float, history: int, fn: Any, state: GradientState, bounds: tuple[Array, Array]) -> GradientState:
+    real, inner = _jaxopt_solver(tol, history, fn).update(state.real, state.inner, bounds)
+    return _moved(state, real, inner, real, inner.value, inner.error <= tol)

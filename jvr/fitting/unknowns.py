@@ -170,16 +170,22 @@ def choose_unknowns(model: Exposed, select: Callable[[Exposed], Any], transforms
     for array in selected:
         place = next((i for i, (_, leaf) in enumerate(paths) if leaf is array), None)
         if place is None:
-            raise ValueError("unknowns must return arrays of the scene itself, for example lambda s: (s.transfer.rgb, s.transfer.sigma_t)")
+            raise ValueError(
+                "unknowns must return arrays of the scene itself, for example lambda s: (s.transfer.rgb, s.transfer.sigma_t)"
+            )
         if not eqx.is_inexact_array(array):
-            raise ValueError(f"{_name(paths[place][0]).removeprefix('scene.')} has integer voxels, which cannot be fitted: convert them to floating point first")
+            raise ValueError(
+                f"{_name(paths[place][0]).removeprefix('scene.')} has integer voxels, which cannot be fitted: convert them to floating point first"
+            )
         places.append(place)
     if not places:
         raise ValueError("unknowns returned no array: name at least one, for example lambda s: s.transfer.rgb")
     names = tuple(_name(paths[i][0]) for i in places)
     given = (None,) * len(places) if transforms is None else tuple(transforms)
     if len(given) != len(places):
-        raise ValueError(f"there are {len(given)} transforms for {len(places)} unknown arrays ({', '.join(names)}): give one for each")
+        raise ValueError(
+            f"there are {len(given)} transforms for {len(places)} unknown arrays ({', '.join(names)}): give one for each"
+        )
     chosen = tuple(t or _default_transform(name, a, model) for t, name, a in zip(given, names, selected, strict=True))
     return Unknowns(tuple(places), names, chosen)
 

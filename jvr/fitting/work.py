@@ -16,6 +16,7 @@ from jvr.fitting.losses import DSSIM, SquaredError
 from jvr.fitting.objective import Normal, Problem, image_value, normal_equations, prior_expansion, residual, value
 from jvr.fitting.observations import Observations, thin
 from jvr.fitting.solvers import Functions
+from jvr.march.differentiation import Rows
 from jvr.model.camera import AbstractCamera
 from jvr.types import Scalar
 
@@ -59,7 +60,7 @@ class ResidualFunction(eqx.Module):
 
         def of_piece(piece: Observations) -> Array:
             scale = jnp.sqrt(piece.weight / self.total)
-            return jnp.stack([scale * c for c in residual(self.problem, model, piece)])
+            return jnp.stack([scale * c for c in residual(self.problem, model, piece, Rows())])
 
         return jnp.ravel(jax.lax.map(of_piece, self.pieces)), None
 

@@ -57,6 +57,9 @@ def _replay_forward(options: MarchOptions, *arguments: Any):
 def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
     wanted, fixed, sums, steps = residuals
     is_zero = lambda x: isinstance(x, jax.custom_derivatives.SymbolicZero)
+    if all(map(is_zero, cotangent.distance)):
+        # Nobody asks for the derivative of the distance: it is then not replayed either.
+        cotangent, sums = cotangent._replace(distance=()), sums._replace(distance=(), distance_low=())
     cotangent = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_zero(x) else x, cotangent, is_leaf=is_zero)
     return replay(wanted, fixed, sums, steps, cotangent._replace(steps=None))
 
@@ -91,7 +94,9 @@ def replay(wanted: Any, fixed: Any, sums: Sums, steps: Int[Array, "rays"], cotan
     """
     medium, rays, dt = eqx.combine(wanted, fixed)
     zeros = functools.partial(jax.tree.map, jnp.zeros_like)
-    lanes = Lanes(rays, jnp.arange(steps.size, dtype=jnp.int32), segment_count(rays.length, dt), zeros(sums), steps)
+    # Only the transmittance is needed on the way; radiance and distance are known from the forward march.
+    depths = zeros(Sums((), (), sums.tau, sums.tau_low, (), ()))
+    lanes = Lanes(rays, jnp.arange(steps.size, dtype=jnp.int32), segment_count(rays.length, dt), depths, steps)
 
     def alive(state: _ReplayLanes, total: _Gradients):
         return total.k < state.lanes.steps
@@ -137,7 +142,7 @@ def _replay_segment(medium: Medium, dt: Scalar, state: _ReplayLanes, total: _Gra
     entries = deposit_entries(entries, medium.transfer, s, entry_cotangent)
     field = medium.field.deposit(total.medium.field, points, s_cotangent)
     medium_gradient = Medium(field, eqx.combine(rest_of_transfer, entries), shader)
-    lanes = lanes._replace(sums=add_segment(lanes.sums, emitted, dtau, u))
+    lanes = lanes._replace(sums=add_segment(lanes.sums, (), dtau, u))
     return _ReplayLanes(lanes, remaining, state.cotangent, ray_gradient), _Gradients(medium_gradient, dt_gradient, k + 1)
 
 

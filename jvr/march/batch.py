@@ -11,7 +11,7 @@ Lanes = TypeVar("Lanes")
 Shared = TypeVar("Shared")
 
 # Below this many lanes one more halving costs more to compile than it saves to run.
-SMALLEST_BATCH = 1024
+SMALLEST_BATCH = 4096
 
 
 def shrinking_while(

@@ -123,7 +123,9 @@ def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> 
 
 def marched(sums: Sums, steps: Int[Array, "rays"]) -> Marched:
     """The sums rounded to one float each."""
-    return Marched(join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), join(sums.distance, sums.distance_low), steps)
+    return Marched(
+        join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), join(sums.distance, sums.distance_low), steps
+    )
 
 
 def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, ""], count: Int[Array, "rays"]):

@@ -17,7 +17,8 @@ def float_array(value: ArrayLike | Any, name: str, *shapes: tuple[int | None, ..
     """
     try:
         array = jnp.asarray(value)
-        array = array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+        # The type is given so that it is not weak: a number and an array of the same type then compile to one program.
+        array = jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else jnp.result_type(float))
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} must be an array of real numbers, not {type(value).__name__}") from error
     fits = any(

@@ -9,7 +9,9 @@ from jvr.model.transfer import LinearTransfer
 from jvr.types import ArrayLike
 
 
-def window_level(window: float, level: float, *, sigma_t: float = 0.05, rgb: ArrayLike = (1.0, 1.0, 1.0)) -> LinearTransfer:
+def window_level(
+    window: float | int, level: float | int, *, sigma_t: float | int = 0.05, rgb: ArrayLike = (1.0, 1.0, 1.0)
+) -> LinearTransfer:
     """Extinction that rises from 0 to `sigma_t` across the window `level - window / 2 ... level + window / 2`.
 
     **Arguments:** `window`, `level`: in the data's units, `window` positive; `sigma_t`: extinction at the top, per world length;
@@ -68,6 +70,6 @@ def ct_vessels() -> LinearTransfer:
     )
 
 
-def _points(rows: list[tuple[float, float, float, float, float]]) -> LinearTransfer:
+def _points(rows: list[tuple[float | int, ...]]) -> LinearTransfer:
     table = np.asarray(rows, dtype=float)
     return LinearTransfer(table[:, 0], table[:, 1:4], table[:, 4])

@@ -64,9 +64,18 @@ def plan(scene: Scene, settings: Settings = Settings()) -> Plan:
         Part("volume", True, f"{voxels}, {type(volume.interpolation).__name__.lower()}, a sample every {settings.step:g} voxels"),
         Part("transfer", True, f"{type(transfer).__name__}, {'coloured' if coloured else 'grey'} extinction"),
         Part("optical model", True, type(scene.optical).__name__),
-        Part("early termination", settings.termination > 0 and not transparent, "nothing absorbs" if transparent else termination),
-        Part("background", scene.background is not None, "shows through" if scene.background is not None else "the scene names none"),
+        Part(
+            "early termination", settings.termination > 0 and not transparent, "nothing absorbs" if transparent else termination
+        ),
+        Part(
+            "background",
+            scene.background is not None,
+            "shows through" if scene.background is not None else "the scene names none",
+        ),
         Part("clipping", scene.clipping is not None, "rays are cut" if scene.clipping is not None else "the scene names none"),
         Part("derivatives", True, f"{type(settings.adjoint).__name__}, if any are asked for"),
     )
-    return Plan(parts, f"{jax.tree.structure((scene, settings))} {jax.tree.map(lambda x: (x.shape, str(x.dtype)), jax.tree.leaves(scene))}")
+    return Plan(
+        parts,
+        f"{jax.tree.structure((scene, settings))} {jax.tree.map(lambda x: (x.shape, str(x.dtype)), jax.tree.leaves(scene))}",
+    )

@@ -1,0 +1,150 @@
+"""The measurements, one function each; every one returns a flat dictionary of numbers."""
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jvr
+from benchmarks import scenes, yardsticks
+from benchmarks.timing import median, ratio, seconds
+from jvr.march.march import MarchOptions, march
+from jvr.rendering.image import enter, step_length
+from jvr.rendering.plan import medium
+
+SIZE = 256
+
+
+def forward() -> dict[str, Any]:
+    """Forward march of a translucent 128^3 float32 volume at 256^2, half-voxel steps, against `vmap` of a `fori_loop`."""
+    volume, settings = scenes.gyroid(), jvr.Settings(0.5, termination=0.0)
+    scene = jvr.Scene(volume, scenes.translucent())
+    camera = scenes.camera(volume, SIZE)
+    rays, _ = jax.jit(lambda: enter(scene, *camera.rays(jnp.arange(SIZE * SIZE, dtype=jnp.int32))))()
+    dt = step_length(scene, settings)
+    ours = jax.jit(lambda scene, rays, dt: march(MarchOptions(0.0, False), medium(scene), rays, dt))
+    gathered = ours(scene, rays, dt)
+    segments = int(gathered.steps.max())
+    plain = jax.jit(lambda volume, transfer, rays, dt: yardsticks.vmapped_march(volume, transfer, rays, dt, segments))
+    difference = np.abs(np.stack(gathered.radiance, -1) - plain(volume, scene.transfer, rays, dt)[0]).max()
+    times = seconds({"jvr": lambda: ours(scene, rays, dt), "vmap": lambda: plain(volume, scene.transfer, rays, dt)}, repeats=5)
+    samples = int(gathered.steps.sum())
+    return {
+        "samples": samples,
+        "seconds": median(times, "jvr"),
+        "samples_per_second": samples / median(times, "jvr"),
+        "vmap_fori_loop_over_jvr": ratio(times, "vmap", "jvr"),
+        "largest_difference": float(difference),
+    }
+
+
+def gradient() -> dict[str, Any]:
+    """Image and gradient of a scalar loss over the image alone: opaque scene, 64-entry transfer function, and all voxels."""
+    volume, settings = scenes.gyroid(), jvr.Settings(0.5)
+    scene, camera = jvr.Scene(volume, scenes.opaque()), scenes.camera(volume, SIZE)
+    image = jax.jit(lambda scene: jvr.render(scene, camera, settings))
+    entries = (scene.transfer.rgb, scene.transfer.sigma_t)
+    into_entries = lambda s: (s.transfer.rgb, s.transfer.sigma_t)
+    into_voxels = lambda s: s.volume.values
+
+    def loss(unknown: Any, into: Any) -> jax.Array:
+        return jnp.mean(jnp.square(jvr.render(eqx.tree_at(into, scene, unknown), camera, settings).rgb - 0.5))
+
+    of_entries = jax.jit(jax.value_and_grad(lambda u: loss(u, into_entries)))
+    of_voxels = jax.jit(jax.value_and_grad(lambda u: loss(u, into_voxels)))
+    times = seconds(
+        {"image": lambda: image(scene), "transfer": lambda: of_entries(entries), "voxels": lambda: of_voxels(volume.values)}
+    )
+    return {
+        "image_seconds": median(times, "image"),
+        "transfer_gradient_over_image": ratio(times, "transfer", "image"),
+        "voxel_gradient_over_image": ratio(times, "voxels", "image"),
+    }
+
+
+def memory() -> dict[str, Any]:
+    """Compiled temporary memory of a gradient, per ray in flight beyond two volumes, at two step lengths."""
+    volume = scenes.gyroid(64)
+    scene, camera = jvr.Scene(volume, scenes.translucent()), scenes.camera(volume, SIZE)
+
+    def temporary(into: Any, unknown: Any, step: float) -> int:
+        def loss(unknown: Any) -> jax.Array:
+            return jnp.mean(jvr.render(eqx.tree_at(into, scene, unknown), camera, jvr.Settings(step)).rgb)
+
+        return jax.jit(jax.value_and_grad(loss)).lower(unknown).compile().memory_analysis().temp_size_in_bytes
+
+    result: dict[str, Any] = {}
+    for name, into in {"transfer": lambda s: s.transfer.sigma_t, "voxels": lambda s: s.volume.values}.items():
+        coarse, fine = (temporary(into, into(scene), step) for step in (0.5, 0.03))
+        result[f"{name}_bytes_per_ray"] = (coarse - 2 * volume.values.nbytes * (name == "voxels")) / SIZE**2
+        result[f"{name}_fine_over_coarse_step"] = fine / coarse
+    return result
+
+
+def fitting() -> dict[str, Any]:
+    """The CT head protocol (docs/fitting.md): time to 60 dB in evaluations of a plain forward march over the same kept samples."""
+    from experiments.protocols import ct_head
+    from jvr.fitting.observations import keep_samples, observe, observed_medium
+
+    protocol = ct_head()
+    if protocol is None:
+        return {"skipped": "needs the CT head of the public volumes: set JVR_DATA to their folder"}
+    start, cameras, images, settings = protocol.start, protocol.cameras, protocol.images, protocol.settings
+    chunk = sum(camera.width * camera.height for camera in cameras)
+    observations = observe(start, cameras, images, None, settings, chunk)
+    kept = keep_samples(start, observations, settings, chunk, 2**31)
+    assert kept is not None
+    through, rays = observed_medium(start, kept[1], kept[0])
+    plain = jax.jit(yardsticks.kept_march)
+    dt = step_length(start, settings)
+    jax.block_until_ready(plain(through, rays, dt))
+    unknowns = lambda s: (s.transfer.rgb, s.transfer.sigma_t)
+    run = lambda: jvr.fit(start, cameras, images, settings=settings, unknowns=unknowns, progress=False)
+    run()
+    evaluations, to_60 = [], []
+    for _ in range(3):
+        began = time.perf_counter()
+        for _ in range(5):
+            jax.block_until_ready(plain(through, rays, dt))
+        evaluations.append((time.perf_counter() - began) / 5)
+        result = run()
+        to_60.append(next((entry.seconds for entry in result.history if entry.psnr >= 60), float("nan")))
+    return {
+        "psnr_at_convergence": result.history[-1].psnr,
+        "iterations": len(result.history),
+        "seconds_to_60_db": statistics.median(to_60),
+        "plain_evaluation_seconds": statistics.median(evaluations),
+        "evaluations_to_60_db": statistics.median(a / b for a, b in zip(to_60, evaluations, strict=True)),
+        "kept_bytes": result.stats.kept_bytes,
+    }
+
+
+def startup() -> dict[str, Any]:
+    """Seconds of `import jvr` beyond `import jax`, and of `jvr render` of a 256^2 picture from a cold process, cache cold and warm."""
+
+    def run(*command: str, **environment: str) -> float:
+        began = time.perf_counter()
+        subprocess.run(command, check=True, capture_output=True, env={**os.environ, **environment})
+        return time.perf_counter() - began
+
+    imports = [run(sys.executable, "-c", "import jvr") - run(sys.executable, "-c", "import jax") for _ in range(5)]
+    with tempfile.TemporaryDirectory() as folder:
+        picture = str(Path(folder) / "picture.png")
+        config = str(Path(__file__).parents[1] / "configs" / "demo.toml")
+        command = (sys.executable, "-m", "jvr.cli", "render", config, "-o", picture, "--set", "camera.width=256")
+        command += ("--set", "camera.height=256")
+        cold = run(*command, XDG_CACHE_HOME=folder)
+        warm = run(*command, XDG_CACHE_HOME=folder)
+    return {"import_beyond_jax": statistics.median(imports), "render_cold": cold, "render_warm": warm}
+
+
+CASES = {"forward": forward, "gradient": gradient, "memory": memory, "fitting": fitting, "startup": startup}

@@ -1,0 +1,168 @@
+"""The commands and their flags."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from jvr.cli.inputs import BadInput, check_folder_output, check_image_output, load, reading
+
+HELP = "Differentiable volume rendering: pictures of scalar volumes, and transfer functions from pictures."
+app = typer.Typer(help=HELP, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
+
+Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key, e.g. settings.step=0.25. Repeatable.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one machine-readable object on stdout.")]
+Shape = Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Voxels of a headerless file.")]
+Dtype = Annotated[str | None, typer.Option(help="NumPy type of a headerless file, such as uint8 or >i2.")]
+Spacing = Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Millimetres between voxels, in place of the file's.")]
+NanValue = Annotated[float | None, typer.Option(help="Number that takes the place of NaN and infinite voxels.")]
+Input = Annotated[Path, typer.Argument(metavar="CONFIG|VOLUME", help="A configuration (.toml) or a volume file.")]
+ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="A configuration (.toml).")]
+
+
+def _examples(*lines: str) -> str:
+    return "\n\n".join(["[bold]Examples[/bold]", *lines])
+
+
+@app.command(epilog=_examples("jvr render configs/demo.toml -o demo.png", "jvr render head.nii.gz --preset ct_bone --size 800"))
+def render(
+    given: Input,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Picture, .exr or .png.", show_default="NAME.png")] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="ct_bone, ct_soft_tissue, ct_lung, ct_vessels; default: an automatic window.")
+    ] = None,
+    size: Annotated[int | None, typer.Option(min=1, help="Width and height in pixels, for every camera.")] = None,
+    sets: Set = None,
+    shape: Shape = None,
+    dtype: Dtype = None,
+    spacing: Spacing = None,
+    nan_value: NanValue = None,
+    as_json: Json = False,
+) -> None:
+    """Render a picture of a configuration's scene, or of a volume file directly."""
+    from jvr.cli.render import render_pictures
+
+    output = Path(f"{given.name.split('.')[0]}.png") if output is None else output
+    with reading():
+        check_image_output(output)
+        transfer = None if preset is None else {"kind": "preset", "preset": preset}
+        config = load(given, [*(sets or [])], _raw_keywords(shape, dtype, spacing, nan_value), transfer)
+        if given.suffix.lower() == ".toml" or size is not None:
+            config = _sized(config, size)
+    report = render_pictures(config, output)
+    lines = [f"{path}" for path in report["outputs"]]
+    _print(
+        report, as_json, "\n".join([*lines, f"{report['seconds']:.2f} s, of which {report['compile_seconds']:.2f} s compiling"])
+    )
+
+
+@app.command(epilog=_examples("jvr fit configs/demo.toml -o out", "jvr fit configs/demo.toml -o out --resume"))
+def fit(
+    given: ConfigFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results; created where it does not exist.")],
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the folder's checkpoint.npz.")] = False,
+    sets: Set = None,
+    as_json: Json = False,
+) -> None:
+    """Find the transfer function (or other unknowns) that makes a volume look like the target images."""
+    from jvr.cli.fit import fit_scene
+
+    with reading():
+        config = load(given, sets or [])
+        check_folder_output(output)
+    report = fit_scene(config, output, resume=resume)
+    _print(report, as_json, _summary(report, output))
+
+
+@app.command(epilog=_examples("jvr plan configs/demo.toml", "jvr plan configs/demo.toml --set settings.termination=0 --json"))
+def plan(given: ConfigFile, sets: Set = None, as_json: Json = False) -> None:
+    """Say what a rendering compiles to: which parts are in the program, and why."""
+    with reading():
+        from jvr.io.config import build_scene, build_settings
+        from jvr.rendering.plan import plan as make_plan
+
+        config = load(given, sets or [])
+        made = make_plan(build_scene(config), build_settings(config))
+    parts = [{"name": p.name, "included": p.included, "reason": p.reason} for p in made.parts]
+    _print({"command": "plan", "config": str(given), "parts": parts}, as_json, str(made))
+
+
+@app.command(epilog=_examples("jvr info head.nii.gz", "jvr info embryo.raw --shape 256,256,256 --dtype uint8 --json"))
+def info(
+    volume: Annotated[Path, typer.Argument(metavar="VOLUME", help="A volume file, or a folder of DICOM slices.")],
+    shape: Shape = None,
+    dtype: Dtype = None,
+    spacing: Spacing = None,
+    nan_value: NanValue = None,
+    array: Annotated[str | None, typer.Option(help="Which array of a .vtk, .vti or .zarr.")] = None,
+    series: Annotated[str | None, typer.Option(help="Which series of a DICOM folder.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Say what a volume holds: shape, type, place in the world, values."""
+    with reading():
+        from jvr.io.describe import describe, format_description
+        from jvr.io.volumes import read_volume
+
+        keywords = _raw_keywords(shape, dtype, spacing, nan_value)
+        found = describe(read_volume(volume, array=array, series=series, **keywords), volume)
+    _print(found, as_json, format_description(found))
+
+
+@app.command(epilog=_examples("jvr demo", "jvr demo -o out"))
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("jvr-demo"),
+    sets: Set = None,
+    as_json: Json = False,
+) -> None:
+    """Fit the transfer function of a small volume made by a formula, from six of its pictures; needs no data."""
+    from jvr.cli.fit import demo_config, fit_scene
+
+    with reading():
+        config = load(demo_config(), sets or [])
+        check_folder_output(output)
+    report = fit_scene(config, output, resume=False)
+    _print(report, as_json, _summary(report, output))
+
+
+def _raw_keywords(shape: str | None, dtype: str | None, spacing: str | None, nan_value: float | None) -> dict[str, Any]:
+    """Keywords of a volume from flags."""
+    given = {"shape": _triple(shape, "--shape", int), "dtype": dtype, "spacing": _triple(spacing, "--spacing", float)}
+    return {name: value for name, value in (given | {"nan_value": nan_value}).items() if value is not None}
+
+
+def _triple(text: str | None, flag: str, kind: type) -> list[Any] | None:
+    if text is None:
+        return None
+    try:
+        numbers = [kind(part) for part in text.replace("x", ",").split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 3 or min(numbers) <= 0:
+        what = "whole numbers of voxels" if kind is int else "numbers of millimetres"
+        raise BadInput(f"{flag} {text}: must be three positive {what} along x, y, z, such as 256,256,128")
+    return numbers
+
+
+def _sized(config: Any, size: int | None) -> Any:
+    """The configuration with square pictures of another size."""
+    if size is None:
+        return config
+    import dataclasses
+
+    cameras = [camera.model_copy(update={"width": size, "height": size}) for camera in config.tables.camera]
+    return dataclasses.replace(config, tables=config.tables.model_copy(update={"camera": cameras}))
+
+
+def _summary(report: dict[str, Any], output: Path) -> str:
+    psnr = report["views"]["mean_psnr"]
+    lines = [f"{report['outcome']} after {len(report['history'])} steps, {report['seconds']:.1f} s; PSNR {psnr:.1f} dB"]
+    if report["held_out"]["psnr"]:
+        lines.append(f"held-out views: PSNR {report['held_out']['mean_psnr']:.1f} dB")
+    return "\n".join([*lines, f"{output / report['page']}"])
+
+
+def _print(report: dict[str, Any], as_json: bool, text: str) -> None:
+    typer.echo(json.dumps(report, allow_nan=False) if as_json else text)

@@ -1,0 +1,170 @@
+"""`jvr fit` and `jvr demo`: one folder with everything that a fit found."""
+
+import json
+import shlex
+import sys
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jvr.cli.inputs import BadInput, explain, reading
+from jvr.cli.runtime import nested, plain, progress, provenance, use_compilation_cache
+from jvr.io.config import Config, FitJob, build_fit, write_transfer
+
+CHECKPOINT = "checkpoint.npz"
+PAGE = "report.html"
+
+
+def demo_config() -> Path:
+    """The configuration of `jvr demo`, in the package or in the repository that it is used from."""
+    package = Path(__file__).parents[1]
+    places = (package / "configs" / "demo.toml", package.parent / "configs" / "demo.toml")
+    found = next((place for place in places if place.exists()), None)
+    if found is None:
+        raise FileNotFoundError("configs/demo.toml is not installed; run `jvr demo` from the repository")
+    return found
+
+
+def fit_scene(config: Config, folder: Path, *, resume: bool) -> dict[str, Any]:
+    """Runs the fit of a configuration and writes pictures, transfer function, numbers and page into `folder`."""
+    use_compilation_cache()
+    began = time.perf_counter()
+    checkpoint = folder / CHECKPOINT
+    with reading(), progress("reading the volume and the target images"):
+        if resume and not checkpoint.exists():
+            raise BadInput(f"--resume: {checkpoint} does not exist; leave --resume out to start anew")
+        job = build_fit(config)
+    folder.mkdir(parents=True, exist_ok=True)
+    result = _fit(job, checkpoint, resume)
+    with progress("writing the results"):
+        report = _write(config, job, result, folder, began)
+    return report
+
+
+def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
+    from jvr.fitting.fit import fit
+
+    keywords = dict(job.keywords, held_out=job.held_out, checkpoint=checkpoint, resume=resume)
+    if not resume:
+        checkpoint.unlink(missing_ok=True)
+    try:
+        return fit(job.scene, job.cameras, job.targets, **keywords)
+    except KeyboardInterrupt:
+        kept = f"{checkpoint} is kept, --resume goes on from it" if checkpoint.exists() else "no step was finished"
+        sys.exit(explain(f"interrupted: {kept}", 1))
+    except ValueError as error:
+        if not _refused_by_jvr(error):
+            raise
+        raise BadInput(f"fit: {error}") from error
+
+
+def _refused_by_jvr(error: ValueError) -> bool:
+    """Whether the error was raised in jvr's own code on purpose, rather than somewhere below it."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return Path(last.filename).is_relative_to(Path(__file__).parents[1]) and (last.line or "").lstrip().startswith("raise")
+
+
+def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float) -> dict[str, Any]:
+    from jvr.io.images import replacing
+
+    fitted = _pictures(result.scene, result.exposure, job.cameras, job)
+    for i, (target, found) in enumerate(zip(job.targets, fitted, strict=True)):
+        _write_views(folder, f"{i:02d}", target, found)
+    held_cameras, held_targets = job.held_out or ((), ())
+    held_fitted = _pictures(result.scene, result.exposure, held_cameras, job)
+    for i, (target, found) in enumerate(zip(held_targets, held_fitted, strict=True)):
+        _write_views(folder, f"held_out_{i:02d}", target, found)
+    write_transfer(folder / "transfer.toml", result.scene.transfer)
+    report = _report(config, job, result, (fitted, held_fitted), time.perf_counter() - began)
+    with replacing(folder / "result.json") as temporary:
+        temporary.write_text(json.dumps(report, allow_nan=False, indent=1), encoding="utf-8")
+    _write_page(folder, config, job, result, fitted)
+    return report
+
+
+def _pictures(scene: Any, exposure: float, cameras: Any, job: FitJob) -> list[np.ndarray]:
+    """What a scene looks like from each camera, in the radiance of the target images."""
+    import jax
+
+    from jvr.rendering.image import render
+
+    program = jax.jit(render)
+    return [exposure * np.asarray(program(scene, camera, job.keywords["settings"]).rgb) for camera in cameras]
+
+
+def _write_views(folder: Path, name: str, target: np.ndarray, fitted: np.ndarray) -> None:
+    from jvr.io.images import write_image
+
+    for kind, image in (("target", target), ("fitted", fitted), ("difference", fitted - target)):
+        write_image(folder / f"{kind}_{name}.exr", image)
+        # A PNG holds no negative light: there the size of the difference is shown, ten times enlarged.
+        write_image(folder / f"{kind}_{name}.png", 10 * np.abs(image) if kind == "difference" else image)
+
+
+def _write_page(folder: Path, config: Config, job: FitJob, result: Any, fitted: list[np.ndarray]) -> None:
+    from jvr.io.describe import describe
+    from jvr.report.page import write_fit_page
+
+    sets = [part for text in config.overrides for part in ("--set", text)]
+    write_fit_page(
+        folder / PAGE,
+        title=Path(config.name).stem.replace("_", " "),
+        result=result,
+        targets=job.targets,
+        fitted=fitted,
+        before=_pictures(job.scene, 1.0, job.cameras, job),
+        truth=job.truth,
+        command=shlex.join(["jvr", "fit", config.name, "-o", str(folder), *sets]),
+        config_text=config.text or None,
+        unknowns=config.tables.fit.unknowns if config.tables.fit else None,
+        histogram=describe(job.scene.volume)["histogram"],
+    )
+
+
+def _report(config: Config, job: FitJob, result: Any, pictures: Any, seconds: float) -> dict[str, Any]:
+    """The machine-readable object of a fit. What the images do not determine has the standard error `null`."""
+    tables = config.tables
+    held_targets = job.held_out[1] if job.held_out else ()
+    errors = dict(zip(tables.fit.unknowns if tables.fit else (), map(np.asarray, result.standard_errors), strict=True))
+    stats = result.stats
+    return {
+        "command": "fit",
+        "config": config.name,
+        "settings": tables.settings.model_dump(),
+        "fit": tables.fit.model_dump() if tables.fit else None,
+        "outcome": result.outcome.value,
+        "exposure": result.exposure,
+        "seconds": seconds,
+        "fit_seconds": stats.seconds,
+        "views": _scores(job.targets, pictures[0]),
+        "held_out": _scores(held_targets, pictures[1]),
+        "history": [{name: plain(value) for name, value in entry._asdict().items()} for entry in result.history],
+        "standard_errors": {name: nested(array) for name, array in errors.items()},
+        "rank": stats.rank,
+        "condition": plain(stats.condition),
+        "residual_variance": plain(stats.residual_variance),
+        "worst_determined": [[name, plain(share)] for name, share in stats.worst],
+        "kept_bytes": stats.kept_bytes,
+        "page": PAGE,
+        **provenance(),
+    }
+
+
+def _scores(targets: Any, fitted: Any) -> dict[str, Any]:
+    """PSNR (of radiance 1) of each view and of all pixels together, and SSIM of each view; `null` for equal images."""
+    from skimage.metrics import structural_similarity
+
+    decibels = lambda error: plain(-10 * np.log10(error)) if error > 0 else None
+    squares = [float(np.mean(np.square(f.astype(np.float64) - t))) for t, f in zip(targets, fitted, strict=True)]
+    ssim = []
+    for target, found in zip(targets, fitted, strict=True):
+        window = min(7, (min(target.shape[:2]) + 1) // 2 * 2 - 1)
+        similar = window >= 3
+        score = structural_similarity(target, found, data_range=1.0, channel_axis=-1, win_size=window) if similar else np.nan
+        ssim.append(plain(score))
+    pixels = [target.size for target in targets]
+    mean = decibels(float(np.average(squares, weights=pixels))) if squares else None
+    return {"psnr": [decibels(s) for s in squares], "mean_psnr": mean, "ssim": ssim}

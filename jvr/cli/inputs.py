@@ -1,0 +1,94 @@
+"""What a person gives to a command: files, folders and flags, refused in one line before any work starts."""
+
+import contextlib
+import os
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from jvr.io.config import Config, config_from, read_config
+
+IMAGES = (".exr", ".png")
+
+
+class BadInput(Exception):
+    """Input that cannot be used; the message is the line that the person sees."""
+
+
+@contextlib.contextmanager
+def reading() -> Iterator[None]:
+    """A stage that only reads and checks input: what it raises is the input's fault. Warnings become lines on stderr."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *rest, **more: explain(f"warning: {message}", 0)
+        try:
+            yield
+        except OSError as error:
+            raise BadInput(_system_problem(error)) from error
+        except (ValueError, TypeError) as error:
+            raise BadInput(str(error)) from error
+
+
+def explain(message: str, status: int) -> int:
+    """Prints one line on stderr and returns the exit status that goes with it."""
+    line = " ".join(message.split())
+    print(f"jvr: {line}", file=sys.stderr)
+    return status
+
+
+def usage_problem(error: Any) -> str:
+    """A wrong command line as one line, with the help that would put it right."""
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context is not None else "jvr"
+    return f"{error.format_message().rstrip('.')}; see {command} --help"
+
+
+def load(
+    given: Path, sets: Sequence[str], volume: dict[str, Any] | None = None, transfer: dict[str, Any] | None = None
+) -> Config:
+    """The configuration of a TOML file, or one made up for a volume file that is named directly."""
+    if given.suffix.lower() == ".toml":
+        if refused := [f"--{key.replace('_', '-')}" for key in (volume or {})] + (["--preset"] if transfer else []):
+            raise BadInput(f"{refused[0]} is for a volume file; for a configuration use --set")
+        return read_config(given, sets)
+    if not given.exists():
+        raise BadInput(f"{given}: no such file; give a configuration (.toml) or a volume")
+    data = {"volume": {"path": str(given.absolute()), **(volume or {})}, "transfer": transfer or {"kind": "window"}}
+    data["background"] = [0.0, 0.0, 0.0]
+    return config_from(data, str(given), given.parent, sets)
+
+
+def check_image_output(path: Path) -> None:
+    """Refuses a picture that could not be written."""
+    if path.suffix.lower() not in IMAGES:
+        raise BadInput(f"-o {path}: pictures are written as .exr (linear) or .png (sRGB)")
+    if path.is_dir():
+        raise BadInput(f"-o {path}: this is a folder; name a file in it, such as {path / 'out.png'}")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise BadInput(f"-o {path}: the file is write-protected; choose another name")
+    _try_to_write(path.parent, f"-o {path}")
+
+
+def check_folder_output(path: Path) -> None:
+    """Refuses a folder that could not be created or written to; it is created once there is something to write."""
+    exists = next(place for place in (path, *path.absolute().parents) if place.exists())
+    if not exists.is_dir():
+        raise BadInput(f"-o {path}: {'this' if exists == path else exists} is a file; name a folder")
+    _try_to_write(exists, f"-o {path}")
+
+
+def _try_to_write(folder: Path, flag: str) -> None:
+    if not folder.is_dir():
+        raise BadInput(f"{flag}: the folder {folder} does not exist; create it first")
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise BadInput(f"{flag}: cannot write to {folder}: {error.strerror}; choose another folder") from error
+
+
+def _system_problem(error: OSError) -> str:
+    """Jvr's own messages name the file already; the system's have it in an attribute."""
+    return f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)

@@ -1,0 +1,66 @@
+"""`jvr render`."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jvr.cli.inputs import reading
+from jvr.cli.runtime import plain, progress, provenance, use_compilation_cache
+from jvr.io.config import Config, build_cameras, build_scene, build_settings
+
+
+def render_pictures(config: Config, output: Path) -> dict[str, Any]:
+    """Renders every camera of a configuration: to `output`, or with several cameras to numbered files beside it."""
+    use_compilation_cache()
+    began = time.perf_counter()
+    with reading():
+        scene, settings = build_scene(config), build_settings(config)
+        cameras = build_cameras(config, scene.volume)
+    import jax
+
+    from jvr.io.images import write_image
+    from jvr.rendering.image import render
+
+    pictures, outputs, compile_seconds = [], _names(output, len(cameras)), 0.0
+    program = jax.jit(render)
+    with progress("rendering"):
+        for i, camera in enumerate(cameras):
+            start = time.perf_counter()
+            compiled = program.lower(scene, camera, settings).compile()
+            compile_seconds += time.perf_counter() - start
+            start = time.perf_counter()
+            picture = jax.block_until_ready(compiled(scene, camera, settings))
+            pictures.append(_numbers(picture, camera, outputs[i], time.perf_counter() - start))
+            # With a background the colours are no longer those of the medium alone, which is what alpha belongs to.
+            alpha = np.asarray(picture.alpha) if scene.background is None else None
+            depth = {"depth": np.asarray(picture.depth)} if outputs[i].suffix.lower() == ".exr" else {}
+            write_image(outputs[i], np.asarray(picture.rgb), alpha, **depth)
+    return {
+        "command": "render",
+        "config": config.name,
+        "outputs": [str(path) for path in outputs],
+        "pictures": pictures,
+        "seconds": time.perf_counter() - began,
+        "compile_seconds": compile_seconds,
+        **provenance(),
+    }
+
+
+def _names(output: Path, count: int) -> list[Path]:
+    if count == 1:
+        return [output]
+    return [output.with_name(f"{output.stem}_{i:02d}{output.suffix}") for i in range(count)]
+
+
+def _numbers(picture: Any, camera: Any, path: Path, seconds: float) -> dict[str, Any]:
+    return {
+        "output": str(path),
+        "width": camera.width,
+        "height": camera.height,
+        "seconds": seconds,
+        "mean_alpha": plain(picture.alpha.mean()),
+        "mean_radiance": plain(picture.rgb.mean()),
+        "mean_steps": plain(picture.stats.steps.mean()),
+    }

@@ -1,0 +1,62 @@
+"""What every command that computes needs: the compilation cache, progress, and a record of what it ran on."""
+
+import contextlib
+import math
+import os
+import sys
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+
+def use_compilation_cache() -> None:
+    """Keeps compiled programs in the user's cache folder, so that the second run starts at once; `JVR_CACHE=0` turns it off."""
+    if os.environ.get("JVR_CACHE", "1") in ("0", "") or "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = root / "jvr" / "xla"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@contextlib.contextmanager
+def progress(message: str) -> Iterator[None]:
+    """A moving sign of life on stderr where that is a terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(message):
+        yield
+
+
+def provenance() -> dict[str, Any]:
+    """Versions and device, for a result that someone wants to repeat."""
+    import jax
+
+    packages = ("jvr", "jax", "jaxlib", "equinox", "optimistix", "numpy")
+    device = jax.devices()[0]
+    return {
+        "versions": {name: metadata.version(name) for name in packages} | {"python": sys.version.split()[0]},
+        "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
+    }
+
+
+def plain(number: Any) -> float | None:
+    """A number as JSON can hold it: `None` where it is not finite."""
+    number = float(number)
+    return number if math.isfinite(number) else None
+
+
+def nested(array: Any) -> Any:
+    """An array as nested lists; what is not finite is `None`."""
+    return [nested(row) for row in array] if getattr(array, "ndim", 0) else plain(array)

@@ -1,0 +1,354 @@
+"""From checked tables to the objects of `jvr`: the one place where a name becomes an object."""
+
+import difflib
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jvr.io.config.errors import ConfigError, blame
+from jvr.io.config.load import Config
+from jvr.io.config.schema import (
+    AnyCamera,
+    AnyTransfer,
+    FitTable,
+    OrthographicTable,
+    PerspectiveTable,
+    RigTable,
+    TransferFile,
+    VolumeTable,
+)
+from jvr.io.config.transfers import build_transfer, read_transfer
+from jvr.march.differentiation import Forward, Replay, Rows
+from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, fibonacci_sphere, look_at, orbit
+from jvr.model.optical import AbsorptionOnly, EmissionAbsorption, EmissionOnly
+from jvr.model.scene import Scene
+from jvr.model.transfer import AbstractTransfer, LutTransfer
+from jvr.model.volume import ClippingBox, Nearest, Trilinear, Volume
+from jvr.rendering.image import render
+from jvr.rendering.settings import Settings
+
+ADJOINTS = {"replay": Replay, "forward": Forward, "rows": Rows}
+INTERPOLATIONS = {"trilinear": Trilinear, "nearest": Nearest}
+OPTICAL = {"emission-absorption": EmissionAbsorption, "emission-only": EmissionOnly, "absorption-only": AbsorptionOnly}
+READ_KEYWORDS = ("shape", "dtype", "spacing", "origin", "array", "series", "axes", "nan_value")
+# From the front of a patient (-y in LPS), a little from above and from the left.
+AUTOMATIC_DIRECTION = np.array([0.45, -1.0, 0.35])
+# How much larger than the box of the volume a picture is.
+MARGIN = 1.05
+
+
+class FitJob(NamedTuple):
+    """A fit as a configuration describes it.
+
+    - `scene`: where it starts; `cameras`, `targets`: of the views that take part.
+    - `truth`: the transfer function that rendered the targets, `None` where they are files.
+    - `held_out`: cameras and images that take no part, `None` without any.
+    - `keywords`: of `jvr.fit`: unknowns, solver, loss, priors and so on.
+    """
+
+    scene: Scene
+    cameras: tuple[AbstractCamera, ...]
+    targets: tuple[np.ndarray, ...]
+    truth: AbstractTransfer | None
+    held_out: tuple[tuple[AbstractCamera, ...], tuple[np.ndarray, ...]] | None
+    keywords: dict[str, Any]
+
+
+def build_settings(config: Config) -> Settings:
+    """`jvr.Settings` of `[settings]`."""
+    table = config.tables.settings
+    with blame(config.name, "settings"):
+        return Settings(table.step, termination=table.termination, adjoint=ADJOINTS[table.adjoint](), tile=table.tile)
+
+
+def build_volume(config: Config) -> Volume:
+    """Reads the volume of `[volume]`, or computes it.
+
+    **Raises** `ConfigError` where its file is missing, and what `jvr.read_volume` raises.
+    """
+    table = config.tables.volume
+    volume = _builtin() if table.path is None else _read(config, table, table.path)
+    interpolation = INTERPOLATIONS[table.interpolation]()
+    values, slope, intercept = volume.values, volume.slope, volume.intercept
+    if table.scale is not None:
+        low, high = table.scale
+        scaled = (np.asarray(values, np.float64) * float(slope) + float(intercept) - low) / (high - low)
+        values, slope, intercept = np.clip(scaled, 0, 1).astype(np.float32), 1.0, 0.0
+    return Volume(values, volume.world_from_grid, slope=slope, intercept=intercept, interpolation=interpolation)
+
+
+def build_scene(config: Config, volume: Volume | None = None) -> Scene:
+    """The scene to render: with `[truth]` where there is one, else with `[transfer]`, else with what a fit starts from."""
+    volume = build_volume(config) if volume is None else volume
+    tables = config.tables
+    if tables.truth is not None:
+        return _scene(config, volume, _transfer(config, tables.truth, volume, "truth"))
+    if tables.transfer is not None:
+        return _scene(config, volume, _transfer(config, tables.transfer, volume, "transfer"))
+    return _scene(config, volume, _start(config, volume))
+
+
+def build_cameras(config: Config, volume: Volume) -> tuple[AbstractCamera, ...]:
+    """All cameras of `[camera]`, in order."""
+    cameras: list[AbstractCamera] = []
+    for i, table in enumerate(config.tables.camera):
+        key = f"camera[{i}]" if len(config.tables.camera) > 1 else "camera"
+        with blame(config.where(key), key):
+            cameras.extend(_cameras(table, volume))
+    return tuple(cameras)
+
+
+def build_fit(config: Config, read_image: Callable[[Path], np.ndarray] | None = None) -> FitJob:
+    """Everything that `jvr.fit` needs; renders the targets of a synthetic experiment.
+
+    **Raises** `ConfigError` where there is no `[fit]`, or something in it does not go together.
+    """
+    fit, tables = config.tables.fit, config.tables
+    if fit is None:
+        raise ConfigError(config.name, "fit", "missing; add a table [fit] that says what to find")
+    volume, settings = build_volume(config), build_settings(config)
+    cameras = build_cameras(config, volume)
+    transfer = _start(config, volume) if tables.transfer is None else _transfer(config, tables.transfer, volume, "transfer")
+    scene = _scene(config, volume, transfer)
+    keywords = {**_keywords(config, fit), "unknowns": _unknowns(config, fit, scene), "settings": settings}
+    if tables.truth is None:
+        images = _images(config, fit, cameras, read_image)
+        (inside, targets), held_out = _held_out_images(config, fit, cameras, images)
+        return FitJob(scene, inside, targets, None, held_out, keywords)
+    truth = _transfer(config, tables.truth, volume, "truth")
+    true_scene, program = _scene(config, volume, truth), jax.jit(render)
+    picture = lambda camera: np.asarray(program(true_scene, camera, settings).rgb)
+    extra = _extra_cameras(config, fit, cameras, volume)
+    inside, outside = ([c for c, out in extra if out == which] for which in (False, True))
+    held_out = (tuple(outside), tuple(map(picture, outside))) if outside else None
+    return FitJob(scene, tuple(inside), tuple(map(picture, inside)), truth, held_out, keywords)
+
+
+def _builtin() -> Volume:
+    from jvr.io.demo import demo_volume
+
+    return demo_volume()
+
+
+def _read(config: Config, table: VolumeTable, path: str) -> Volume:
+    from jvr.io.volumes import read_volume
+
+    found = config.find(path, "volume.path", table.source)
+    keywords = {name: getattr(table, name) for name in READ_KEYWORDS if getattr(table, name) is not None}
+    return read_volume(found, **keywords)
+
+
+def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
+    tables = config.tables
+    clipping = None
+    if tables.clipping is not None:
+        with blame(config.where("clipping"), "clipping"):
+            clipping = ClippingBox(tables.clipping.lower, tables.clipping.upper)
+    return Scene(volume, transfer, background=tables.background, optical=OPTICAL[tables.optical](), clipping=clipping)
+
+
+def _transfer(config: Config, table: AnyTransfer, volume: Volume, key: str) -> AbstractTransfer:
+    if isinstance(table, TransferFile):
+        return read_transfer(config.find(table.path, f"{key}.path"))
+    return build_transfer(table, volume, config.where(key), key)
+
+
+def _start(config: Config, volume: Volume) -> AbstractTransfer:
+    """A flat table over the volume's range of values, or a given one."""
+    from jvr.fitting.initialise import flat_transfer
+
+    fit = config.tables.fit
+    start = None if fit is None else fit.start
+    if start is None:
+        with blame(config.where("volume"), "volume"):
+            return flat_transfer(volume)
+    with blame(config.where("fit.start"), "fit.start"):
+        opacity = 0.018 if start.opacity is None else start.opacity
+        sigma_t = opacity / float(jnp.min(volume.spacing)) if start.sigma_t is None else start.sigma_t
+        if start.domain is None:
+            flat = flat_transfer(volume, start.entries, opacity=sigma_t * float(jnp.min(volume.spacing)), grey=start.grey)
+            return flat
+        return LutTransfer(np.full((start.entries, 3), start.grey), np.full(start.entries, sigma_t), start.domain)
+
+
+def _cameras(table: AnyCamera, volume: Volume) -> tuple[AbstractCamera, ...]:
+    """The cameras of one table; what it leaves out comes from the box of the volume."""
+    center = np.asarray(volume.center if table.target is None else table.target, float)
+    if isinstance(table, RigTable):
+        return _rig(table, center, float(volume.radius))
+    right, up, back = _pose(table, center)
+    corners = _corners(volume) - center
+    x, y, depth = np.abs(corners @ right), np.abs(corners @ up), corners @ back
+    aspect = table.width / table.height
+    if isinstance(table, PerspectiveTable):
+        half = np.tan(np.radians(table.fov_y / 2))
+        distance = np.max(np.maximum(x / (half * aspect), y / half) * MARGIN + depth)
+        pose = look_at(center + distance * back if table.eye is None else table.eye, center, up)
+        return (PerspectiveCamera(pose, table.fov_y, table.width, table.height),)
+    extent = 2 * MARGIN * np.max(np.maximum(x / aspect, y)) if table.height_world is None else table.height_world
+    pose = look_at(center + (np.max(depth) + extent) * back if table.eye is None else table.eye, center, up)
+    return (OrthographicCamera(pose, extent, table.width, table.height),)
+
+
+def _corners(volume: Volume) -> np.ndarray:
+    """World positions of the eight corners of the domain, `(8, 3)`."""
+    low, high = volume.domain
+    grid = np.array(list(itertools.product(*zip(low, high, strict=True))))
+    matrix = np.asarray(volume.world_from_grid, float)
+    return grid @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _pose(table: PerspectiveTable | OrthographicTable, center: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Axes of the camera: right, up and back. z is up unless the view is along it."""
+    back = AUTOMATIC_DIRECTION if table.eye is None else np.asarray(table.eye) - center
+    if np.allclose(back, 0):
+        raise ValueError("eye and target are the same point: move one of them")
+    back = back / np.linalg.norm(back)
+    upward = np.eye(3)[2 if abs(back[2]) < 0.999 else 1] if table.up is None else np.asarray(table.up)
+    right = np.cross(upward, back)
+    if not np.linalg.norm(right) > 1e-6 * np.linalg.norm(upward):
+        raise ValueError("up must not be zero or parallel to the view: choose another")
+    right = right / np.linalg.norm(right)
+    return right, np.cross(back, right), back
+
+
+def _rig(table: RigTable, center: np.ndarray, reach: float) -> tuple[PerspectiveCamera, ...]:
+    if table.half_angle_tangent is not None:
+        fov_y = 2 * np.degrees(np.arctan(table.half_angle_tangent))
+    else:
+        fov_y = 30.0 if table.fov_y is None else table.fov_y
+    aspect = min(1.0, table.width / table.height)
+    half = np.arctan(np.tan(np.radians(fov_y / 2)) * aspect)
+    radius = reach / np.sin(half) if table.radius is None else table.radius
+    if table.kind == "fibonacci":
+        return fibonacci_sphere(center, radius, table.count, fov_y, table.width, table.height)
+    axis = (0.0, 0.0, 1.0) if table.axis is None else table.axis
+    return orbit(center, radius, table.count, fov_y, table.width, table.height, axis=axis)
+
+
+def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:
+    from jvr.fitting.losses import DSSIM, AbsoluteError, Huber, SquaredError
+
+    losses = {
+        "squared-error": SquaredError,
+        "absolute-error": AbsoluteError,
+        "dssim": DSSIM,
+        "huber": lambda: Huber(fit.huber_delta),
+    }
+    return {
+        "solver": _solver(fit),
+        "loss": losses[fit.loss](),
+        "priors": _priors(config, fit),
+        "exposure": fit.exposure,
+        "keep_samples": fit.keep_samples,
+        "max_steps": fit.max_steps,
+    }
+
+
+def _solver(fit: FitTable) -> Any:
+    import optax
+    import optimistix as optx
+
+    from jvr.fitting.solvers import LBFGSB, Dogleg, GaussNewton, LevenbergMarquardt
+
+    chunked = {"levenberg-marquardt": LevenbergMarquardt, "gauss-newton": GaussNewton, "dogleg": Dogleg}
+    if fit.solver in chunked:
+        return chunked[fit.solver](**({} if fit.rtol is None else {"rtol": fit.rtol}))
+    rtol = 1e-6 if fit.rtol is None else fit.rtol
+    if fit.solver == "lbfgsb":
+        return LBFGSB(tol=rtol)
+    if fit.solver == "adam":
+        return optx.OptaxMinimiser(optax.adam(fit.learning_rate), rtol=rtol, atol=rtol)
+    quasi_newton = {"bfgs": optx.BFGS, "lbfgs": optx.LBFGS}[fit.solver]
+    return quasi_newton(rtol=rtol, atol=1e-2 * rtol)
+
+
+def _priors(config: Config, fit: FitTable) -> tuple[Any, ...]:
+    from jvr.fitting.losses import ColourSmoothness, ExtinctionSmoothness, Sparsity
+
+    kinds = {"colour_smoothness": ColourSmoothness, "extinction_smoothness": ExtinctionSmoothness, "sparsity": Sparsity}
+    strengths = {name: getattr(fit.priors, name) for name in kinds}
+    return tuple(kinds[name](strength) for name, strength in strengths.items() if strength)
+
+
+def _unknowns(config: Config, fit: FitTable, scene: Scene) -> Callable[[Scene], Any]:
+    """Picks the arrays of a scene that `fit.unknowns` names."""
+    arrays = {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(scene)}
+    fittable = [name for name, leaf in arrays.items() if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    for i, name in enumerate(fit.unknowns):
+        if name in fittable:
+            continue
+        near = difflib.get_close_matches(name, fittable, 1, 0.6)
+        hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(fittable)}"
+        problem = "holds whole numbers, which cannot be fitted" if name in arrays else "is not an array of the scene"
+        key = f"fit.unknowns[{i}]"
+        raise ConfigError(config.where(key), key, f"'{name}' {problem}; {hint}")
+
+    def select(scene: Scene) -> Any:
+        found = dict(jax.tree_util.tree_leaves_with_path(scene))
+        named = {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in found.items()}
+        return tuple(named[name] for name in fit.unknowns)
+
+    return select
+
+
+def _images(config: Config, fit: FitTable, cameras: tuple[AbstractCamera, ...], read_image: Any) -> list[np.ndarray]:
+    if read_image is None:
+        from jvr.io.images import read_image
+    images = []
+    for i, name in enumerate(fit.images or ()):
+        key = f"fit.images[{i}]"
+        with blame(config.where(key), key):
+            images.append(np.asarray(read_image(config.find(name, key))))
+    if len(images) != len(cameras):
+        where = config.where("fit.images")
+        raise ConfigError(where, "fit.images", f"{len(images)} images for {len(cameras)} cameras: give one for each camera")
+    for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        if image.shape[:2] != (camera.height, camera.width):
+            key, size = f"fit.images[{i}]", f"{image.shape[1]} x {image.shape[0]}"
+            problem = f"is {size} pixels, its camera sees {camera.width} x {camera.height}: resize one of them"
+            raise ConfigError(config.where(key), key, problem)
+    return images
+
+
+def _held_out_images(config: Config, fit: FitTable, cameras: tuple[AbstractCamera, ...], images: list[np.ndarray]) -> Any:
+    chosen = _indices(config, fit.held_out, len(cameras))
+    pick = lambda inside: [(c, t) for i, (c, t) in enumerate(zip(cameras, images, strict=True)) if (i in chosen) != inside]
+    split = lambda pairs: (tuple(c for c, _ in pairs), tuple(t for _, t in pairs))
+    return split(pick(True)), split(pick(False)) if chosen else None
+
+
+def _indices(config: Config, held_out: Any, count: int) -> set[int]:
+    chosen = set(held_out) if isinstance(held_out, list) else set()
+    if any(i >= count for i in chosen) or len(chosen) >= count:
+        where = config.where("fit.held_out")
+        raise ConfigError(
+            where, "fit.held_out", f"{sorted(chosen)} must be indices from 0 to {count - 1} and leave one view over"
+        )
+    return chosen
+
+
+def _extra_cameras(
+    config: Config, fit: FitTable, cameras: tuple[AbstractCamera, ...], volume: Volume
+) -> list[tuple[AbstractCamera, bool]]:
+    """The cameras, each with whether it is held out; a number asks for views between the given ones."""
+    if isinstance(fit.held_out, list):
+        chosen = _indices(config, fit.held_out, len(cameras))
+        return [(camera, i in chosen) for i, camera in enumerate(cameras)]
+    given = [(camera, False) for camera in cameras]
+    if not fit.held_out:
+        return given
+    first = cameras[0]
+    if not isinstance(first, PerspectiveCamera):
+        where = config.where("fit.held_out")
+        raise ConfigError(where, "fit.held_out", "extra views are for perspective cameras: give a list of indices instead")
+    center = np.asarray(volume.center)
+    radius = float(np.linalg.norm(np.asarray(first.world_from_camera)[:3, 3] - center))
+    # Every second view of a finer spiral: none of them is a view of a rig with fewer cameras.
+    finer = fibonacci_sphere(center, radius, 2 * fit.held_out + 1, first.fov_y, first.width, first.height)
+    return [*given, *((camera, True) for camera in finer[1::2])]

@@ -1,0 +1,141 @@
+"""Transfer functions in TOML: as a table of a configuration, and as a file of their own that a fit writes."""
+
+import os
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from jvr.io.config.errors import ConfigError, blame, first_complaint
+from jvr.io.config.schema import (
+    AnyTransfer,
+    GaussianPart,
+    GaussianTable,
+    LinearTable,
+    LutTable,
+    PresetTable,
+    SampledTable,
+    TransferTable,
+    WindowTable,
+)
+from jvr.io.images import replacing
+from jvr.model import presets
+from jvr.model.transfer import AbstractTransfer, GaussianTransfer, LinearTransfer, LutTransfer
+from jvr.model.volume import Volume
+
+HEADER = "# A transfer function of jvr: colours are linear RGB, extinction is per world length (mm).\n"
+FIELDS = {
+    LinearTransfer: ("linear", ("positions", "rgb", "sigma_t")),
+    LutTransfer: ("lut", ("domain", "rgb", "sigma_t")),
+    GaussianTransfer: ("gaussian", ("center", "width", "height", "rgb")),
+}
+# Optical depth of an automatic window's brightest value, from the centre of the volume to its farthest corner.
+AUTOMATIC_DEPTH = 30.0
+
+
+def write_transfer(path: str | os.PathLike, transfer: AbstractTransfer) -> None:
+    """Writes a transfer function as TOML, every number exactly; the file is replaced at once or not at all.
+
+    **Raises** `TypeError` for a kind of transfer function that has no form in TOML.
+    """
+    if type(transfer) not in FIELDS:
+        raise TypeError(f"{type(transfer).__name__} cannot be written as TOML")
+    kind, names = FIELDS[type(transfer)]
+    lines = [f"{name} = {_toml(np.asarray(getattr(transfer, name)))}\n" for name in names]
+    with replacing(path) as temporary:
+        temporary.write_text("".join([HEADER, f'kind = "{kind}"\n', *lines]), encoding="utf-8")
+
+
+def read_transfer(path: str | os.PathLike) -> AbstractTransfer:
+    """Reads what `write_transfer` wrote, or any other table of a transfer function that needs no volume.
+
+    **Raises** `ConfigError` for anything else, `OSError` where the file cannot be read.
+    """
+    name = str(path)
+    try:
+        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(name, "", f"not valid TOML: {error}") from None
+    try:
+        table = TypeAdapter(TransferTable).validate_python(data)
+    except ValidationError as error:
+        raise ConfigError(name, *first_complaint(error, data)) from None
+    return build_transfer(table, None, name, "")
+
+
+def build_transfer(table: AnyTransfer, volume: Volume | None, where: str, key: str) -> AbstractTransfer:
+    """The transfer function of a table; an automatic window looks at the volume."""
+    with blame(where, key):
+        match table:
+            case LinearTable():
+                return LinearTransfer(table.positions, table.rgb, table.sigma_t)
+            case LutTable():
+                return LutTransfer(table.rgb, table.sigma_t, table.domain)
+            case GaussianTable():
+                return GaussianTransfer(table.center, table.width, table.height, table.rgb)
+            case SampledTable():
+                return _sampled(table)
+            case PresetTable():
+                return getattr(presets, table.preset)()
+            case WindowTable():
+                return _window(table, volume)
+        raise ConfigError(where, key, "a transfer file cannot name another file")
+
+
+def _toml(array: np.ndarray) -> str:
+    if array.ndim == 1:
+        return f"[{', '.join(_digits(x) for x in array)}]"
+    return "[\n" + "".join(f"  {_toml(row)},\n" for row in array) + "]"
+
+
+def _digits(x: Any) -> str:
+    """The shortest digits that give exactly this number again when read as float64 and converted."""
+    text = str(x)
+    return text if type(x)(float(text)) == x else repr(float(x))
+
+
+def _sampled(table: SampledTable) -> LutTransfer:
+    s = np.linspace(table.domain[0], table.domain[1], table.entries)
+    sigma_t = np.zeros_like(s)
+    for part in table.extinction:
+        if isinstance(part, GaussianPart):
+            sigma_t += part.height * np.exp(-0.5 * np.square((s - part.center) / part.width))
+        else:
+            low, high = part.between
+            sigma_t += part.height * np.clip((s - low) / (high - low), 0, 1)
+    return LutTransfer(_blend(s, np.asarray(table.positions), np.asarray(table.rgb)), sigma_t, table.domain)
+
+
+def _blend(s: np.ndarray, positions: np.ndarray, rgb: np.ndarray) -> np.ndarray:
+    """Colours between those at `positions`, by smoothstep, so that they have no kinks."""
+    u = np.interp(s, positions, np.arange(len(positions)))
+    low = np.minimum(u.astype(int), max(len(positions) - 2, 0))
+    fraction = np.clip(u - low, 0, 1)[:, None]
+    fraction = fraction * fraction * (3 - 2 * fraction)
+    return (1 - fraction) * rgb[low] + fraction * rgb[np.minimum(low + 1, len(rgb) - 1)]
+
+
+def _window(table: WindowTable, volume: Volume | None) -> LinearTransfer:
+    if volume is None and (table.window is None or table.sigma_t is None):
+        raise ValueError("a window in a file of its own needs window, level and sigma_t")
+    top = AUTOMATIC_DEPTH / float(volume.radius) if table.sigma_t is None and volume is not None else table.sigma_t or 0.0
+    if table.window is not None and table.level is not None:
+        return presets.window_level(table.window, table.level, sigma_t=top, rgb=table.rgb)
+    low, high = _contents(volume) if volume is not None else (0.0, 1.0)
+    # Darker and fainter below than a ramp would be: what surrounds the brightest parts must not hide them.
+    rgb = np.outer([0.1, 0.4, 1.0], table.rgb)
+    return LinearTransfer([low, 0.5 * (low + high), high], rgb, np.array([0.0, 0.1, 1.0]) * top)
+
+
+def _contents(volume: Volume) -> tuple[float, float]:
+    """From where the surroundings end (Otsu's threshold) to the brightest voxels but a few."""
+    from skimage.filters import threshold_otsu
+
+    every = max(volume.values.size // 2**20, 1)
+    values = np.asarray(volume.values).reshape(-1)[::every].astype(np.float64) * float(volume.slope) + float(volume.intercept)
+    if values.min() == values.max():
+        raise ValueError(f"every voxel has the value {values.min():g}: there is nothing to see")
+    low, high = float(threshold_otsu(values)), float(np.percentile(values, 99.9))
+    return (low, high) if low < high else (float(values.min()), float(values.max()))

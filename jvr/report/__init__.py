@@ -1,0 +1,1 @@
+"""What a person looks at after a fit: figures and one HTML page."""

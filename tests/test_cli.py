@@ -1,0 +1,267 @@
+"""The command line: exit status, one line for every mistake, nothing half written, resuming, machine-readable output."""
+
+import json
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jvr
+from jvr import cli
+from jvr.io.config import read_transfer
+from jvr.io.images import read_image
+
+FIT = """
+[volume]
+builtin = "demo"
+[camera]
+kind = "fibonacci"
+count = 2
+fov_y = 40.0
+width = 12
+height = 10
+[settings]
+step = 1.0
+[truth]
+kind = "linear"
+positions = [0.0, 0.3, 0.6, 1.0]
+rgb = [[0.1, 0.2, 0.5], [0.2, 0.4, 0.9], [1.0, 0.7, 0.2], [1.0, 0.1, 0.1]]
+sigma_t = [0.0, 0.03, 0.2, 0.5]
+[fit]
+max_steps = 5
+held_out = 1
+solver = "levenberg-marquardt"
+[fit.start]
+entries = 6
+domain = [0.0, 1.0]
+"""
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """Every test runs in a folder of its own, without the user's data and cache."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("JVR_DATA", raising=False)
+    monkeypatch.setenv("JVR_CACHE", "0")
+    (tmp_path / "fit.toml").write_text(FIT)
+    np.save(tmp_path / "volume.npy", np.linspace(-1000, 1000, 6 * 7 * 8, dtype=np.float32).reshape(6, 7, 8))
+
+
+def snapshot(folder):
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        ("rendr fit.toml", "rendr"),
+        ("render", "CONFIG|VOLUME"),
+        ("render fit.toml --sze 5", "--size"),
+        ("render fit.toml --size big -o a.png", "--size"),
+        ("render fit.toml --size 0 -o a.png", "--size"),
+        ("render fti.toml -o a.png", "did you mean 'fit.toml'?"),
+        ("render volum.npy -o a.png", "volum.npy: no such file"),
+        ("render fit.toml -o a.jpg", ".exr (linear) or .png (sRGB)"),
+        ("render fit.toml -o a/b/c.png", "does not exist"),
+        ("render fit.toml -o folder.png", "this is a folder"),
+        ("render fit.toml -o kept.png --set settings.step=0.5mm", "settings.step"),
+        ("render fit.toml -o kept.png --set settings.stp=1", "did you mean 'step'?"),
+        ("render fit.toml -o kept.png --set volume.path=x.mhd", "$JVR_DATA"),
+        ("render fit.toml -o kept.png --preset ct_bone", "--preset"),
+        ("render volume.npy -o kept.png --preset ct_bones", "did you mean 'ct_bone'?"),
+        ("render volume.npy -o kept.png --shape 6,7", "--shape"),
+        ("render kept.png -o kept.png", "unsupported extension"),
+        ("fit fit.toml", "--output"),
+        ("fit fit.toml -o kept.png", "this is a file"),
+        ("fit fit.toml -o new --resume", "--resume"),
+        ("fit fit.toml -o new --set fit.solvr=x", "did you mean 'solver'?"),
+        ("fit fit.toml -o new --set fit.unknowns=['transfer.rbg']", "did you mean 'transfer.rgb'?"),
+        ("fit fit.toml -o new --set truth={}", "truth.kind"),
+        ("plan volume.npy --set settings.tile=0", "settings.tile"),
+        ("info volume.nii", "volume.npy"),
+        ("info fit.toml", "unsupported extension"),
+        ("info volume.npy --spacing 1,0,1", "--spacing"),
+        ("demo -o kept.png", "this is a file"),
+        ("demo -o new --set fit.max_steps=many", "fit.max_steps"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(line, hint, tmp_path, capfd):
+    (tmp_path / "kept.png").write_text("precious")
+    (tmp_path / "folder.png").mkdir()
+    before = snapshot(tmp_path)
+    assert cli.run(line.split()) == 2
+    printed = capfd.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1
+    assert printed.err.startswith("jvr: ")
+    assert hint in printed.err
+    assert snapshot(tmp_path) == before
+
+
+def test_a_write_protected_output_is_refused_before_work(tmp_path, capsys, monkeypatch):
+    if os.access("/proc/version", os.W_OK) and os.geteuid() != 0:
+        pytest.skip("needs a folder that cannot be written to")
+    folder = Path("/proc") if os.geteuid() == 0 else tmp_path / "locked"
+    if os.geteuid() != 0:
+        folder.mkdir()
+        folder.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    for line in (f"render fit.toml -o {folder}/a.png", f"fit fit.toml -o {folder}/out"):
+        assert cli.run(line.split()) == 2
+        assert str(folder) in capsys.readouterr().err
+
+
+def test_help_shows_examples(capsys):
+    assert cli.run([]) == 0
+    assert "render" in capsys.readouterr().out
+    for command in ("render", "fit", "plan", "info", "demo"):
+        assert cli.run([command, "--help"]) == 0
+        assert f"jvr {command}" in capsys.readouterr().out.split("Examples")[1]
+
+
+def test_a_configuration_renders_to_png_and_exr(tmp_path, capsys):
+    one_camera = ["--set", "camera={width=9, height=7}"]
+    assert cli.run(["render", "fit.toml", "-o", "a.exr", "--json", *one_camera]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["outputs"] == ["a.exr"]
+    assert report["pictures"][0]["width"] == 9
+    assert report["versions"]["jvr"]
+    image = read_image("a.exr")
+    assert image.shape == (7, 9, 3)
+    assert image.max() > 0.05
+    assert cli.run(["render", "fit.toml", "-o", "a.png", *one_camera, "--set", "background=[0,0,0]"]) == 0
+    np.testing.assert_allclose(read_image("a.png"), image, atol=0.02)
+
+
+def test_several_cameras_give_numbered_pictures(tmp_path):
+    assert cli.run(["render", "fit.toml", "-o", "a.png", "--size", "6"]) == 0
+    assert {path.name for path in tmp_path.glob("*.png")} == {"a_00.png", "a_01.png"}
+    assert read_image("a_00.png").shape == (6, 6, 3)
+
+
+@pytest.mark.parametrize("flags", ["", "--preset ct_bone"])
+def test_a_volume_file_renders_directly(flags, tmp_path):
+    assert cli.run(f"render volume.npy -o v.png --size 8 {flags}".split()) == 0
+    assert read_image("v.png").max() > 0.05
+
+
+def test_plan_and_info_as_text_and_json(tmp_path, capsys):
+    assert cli.run(["plan", "fit.toml"]) == 0
+    assert "+ early termination" in capsys.readouterr().out
+    assert cli.run(["plan", "fit.toml", "--json", "--set", "settings.termination=0"]) == 0
+    parts = {part["name"]: part["included"] for part in json.loads(capsys.readouterr().out)["parts"]}
+    assert not parts["early termination"]
+    assert cli.run(["info", "volume.npy", "--json", "--spacing", "1,2,3"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["shape"], found["spacing"]) == ([6, 7, 8], [1, 2, 3])
+    np.arange(24, dtype=">i2").tofile("v.raw")
+    assert cli.run(["info", "v.raw", "--shape", "2x3x4", "--dtype", ">i2"]) == 0
+    assert "0 ... 23" in capsys.readouterr().out
+
+
+def test_an_interrupted_fit_goes_on_to_the_same_answer(tmp_path, capfd, monkeypatch):
+    assert cli.run(["fit", "fit.toml", "-o", "whole", "--json"]) == 0
+    whole = json.loads(capfd.readouterr().out)
+    save, calls = jvr.fitting.checkpoint.save, []
+
+    def interrupted(*arguments):
+        save(*arguments)
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("jvr.fitting.checkpoint.save", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        cli.run(["fit", "fit.toml", "-o", "halves"])
+    assert ended.value.code == 1
+    printed = capfd.readouterr().err
+    assert printed.count("\n") == 1
+    assert "checkpoint.npz is kept" in printed
+    assert {path.name for path in (tmp_path / "halves").iterdir()} == {"checkpoint.npz"}
+
+    assert cli.run(["fit", "fit.toml", "-o", "halves", "--resume", "--json"]) == 0
+    halves = json.loads(capfd.readouterr().out)
+    assert len(halves["history"]) == len(whole["history"])
+    assert [h["loss"] for h in halves["history"]] == [h["loss"] for h in whole["history"]]
+    assert (tmp_path / "halves/transfer.toml").read_text() == (tmp_path / "whole/transfer.toml").read_text()
+
+    _folder_of_a_fit(tmp_path / "whole", whole)
+    before = snapshot(tmp_path)
+    assert cli.run(["fit", "fit.toml", "-o", "whole", "--resume", "--set", "settings.step=0.9"]) == 2
+    assert "checkpoint.npz: written by a fit of another scene" in capfd.readouterr().err
+    assert snapshot(tmp_path) == before
+
+
+def _folder_of_a_fit(folder, printed):
+    """Everything that a fit writes is there, whole, and agrees."""
+    names = {path.name for path in folder.iterdir()}
+    views = [f"{kind}_{view}" for kind in ("target", "fitted", "difference") for view in ("00", "01", "held_out_00")]
+    assert {f"{view}{ending}" for view in views for ending in (".exr", ".png")} <= names
+    assert not [name for name in names if name.endswith(".part")]
+    assert "jvr fit fit.toml -o whole" in (folder / printed["page"]).read_text()
+    report = json.loads((folder / "result.json").read_text())
+    assert report == printed
+    assert report["views"]["mean_psnr"] > report["history"][0]["psnr"]
+    assert report["settings"]["step"] == 1.0
+    assert report["device"]["platform"]
+    errors = report["standard_errors"]
+    assert (len(errors["transfer.rgb"]), len(errors["transfer.sigma_t"])) == (6, 6)
+    assert read_transfer(folder / "transfer.toml").rgb.shape == (6, 3)
+    difference = read_image(folder / "fitted_00.exr") - read_image(folder / "target_00.exr")
+    np.testing.assert_allclose(read_image(folder / "difference_00.exr"), difference, atol=1e-6)
+    mean = np.mean([np.mean(read_image(folder / f"difference_0{i}.exr") ** 2.0) for i in range(2)])
+    assert report["views"]["mean_psnr"] == pytest.approx(-10 * np.log10(mean), abs=1e-3)
+
+
+def test_images_in_files_can_be_fitted_and_must_fit_their_cameras(tmp_path, capfd):
+    assert cli.run(["render", "fit.toml", "-o", "t.exr"]) == 0
+    (tmp_path / "images.toml").write_text(
+        FIT.split("[truth]")[0] + "[fit]\nimages = ['t_00.exr', 't_01.exr']\nmax_steps = 1\nstart = {entries = 6}\n"
+    )
+    capfd.readouterr()
+    assert cli.run(["fit", "images.toml", "-o", "out", "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["held_out"]["psnr"] == []
+    for change, hint in (
+        ("camera.width=13", "resize"),
+        ("camera.count=3", "2 images for 3 cameras"),
+        ("fit.images[1]=t_02.exr", "fit.images[1]"),
+        ("fit.held_out=[7]", "fit.held_out"),
+    ):
+        assert cli.run(["fit", "images.toml", "-o", "new", "--set", change]) == 2
+        assert hint in capfd.readouterr().err
+
+
+def test_an_error_of_our_own_is_not_taken_for_bad_input(monkeypatch):
+    def broken(*arguments, **keywords):
+        raise ValueError("a mistake in the program")
+
+    monkeypatch.setattr("jvr.cli.render._numbers", broken)
+    with pytest.raises(ValueError, match="a mistake in the program"):
+        cli.run(["render", "fit.toml", "-o", "a.png", "--size", "6"])
+
+
+def test_the_installed_command_starts_and_refuses(tmp_path):
+    environment = {**os.environ, "JVR_CACHE": "0"}
+    command = [sys.executable, "-c", "from jvr.cli import main; main()", "render", "other/no.toml"]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr == "jvr: other/no.toml: no such file\n"
+
+
+def test_the_compilation_cache_lies_in_the_users_cache_folder(tmp_path, monkeypatch):
+    import jax
+
+    from jvr.cli.runtime import use_compilation_cache
+
+    monkeypatch.setenv("JVR_CACHE", "1")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    before = jax.config.jax_compilation_cache_dir
+    try:
+        use_compilation_cache()
+        assert jax.config.jax_compilation_cache_dir == str(tmp_path / "cache" / "jvr" / "xla")
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)

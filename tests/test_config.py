@@ -1,0 +1,301 @@
+"""Configurations: what is refused and how, overrides, where files are searched, and transfer functions in TOML."""
+
+import tomllib
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jvr
+from jvr.io.config import (
+    ConfigError,
+    build_cameras,
+    build_fit,
+    build_scene,
+    build_settings,
+    config_from,
+    read_config,
+    read_transfer,
+    write_transfer,
+)
+from jvr.rendering.image import enter
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+BASE = '[volume]\nbuiltin = "demo"\n[transfer]\nkind = "window"\n'
+LINEAR = "transfer={kind='linear',positions=[0,1],rgb=[[1,1,1],[1,1,1]],sigma_t=[1,2]}"
+
+
+def config(text=BASE, *sets):
+    return config_from(tomllib.loads(text), "config.toml", Path(), sets)
+
+
+def build(made):
+    scene = build_scene(made)
+    return scene, build_cameras(made, scene.volume), build_settings(made)
+
+
+def refusal(text, *sets):
+    with pytest.raises(ConfigError) as caught:
+        build(config(text, *sets))
+    line = str(caught.value)
+    assert "\n" not in line
+    assert len(line) < 400
+    return line
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "hint"),
+    [
+        ("[fit]\nsolvr = 'dogleg'", "fit.solvr", "did you mean 'solver'?"),
+        ("[fit]\nsolver = 'levenberg'", "fit.solver", "did you mean 'levenberg-marquardt'?"),
+        ("[settings]\nstep = '0.5mm'", "settings.step", "voxels"),
+        ("[settings]\nstep = -0.5", "settings.step", "must be above 0"),
+        ("[settings]\nstep = true", "settings.step", "not true"),
+        ("[settings]\nstep = inf", "settings.step", "finite"),
+        ("[settings]\ntermination = 1.5", "settings.termination", "at most"),
+        ("[settings]\ntile = 0", "settings.tile", "at least 1"),
+        ("[settings]\nadjoint = 'Replay'", "settings.adjoint", "did you mean 'replay'?"),
+        ("[camera]\nfov_y = 200", "camera.fov_y", "degrees"),
+        ("[camera]\nfov_y = '30deg'", "camera.fov_y", "degrees"),
+        ("[camera]\neye = [0, 1]", "camera.eye", "3 numbers"),
+        ("[camera]\neye = [0, 0, 0]\ntarget = [0, 0, 0]", "camera", "eye and target"),
+        ("[camera]\nup = [0, 0, 0]", "camera", "up must not be zero"),
+        ("[[camera]]\n[[camera]]\neyes = [0, 1, 2]", "camera[1].eyes", "did you mean 'eye'?"),
+        ("[[camera]]\n[[camera]]\nkind = 'orbit'", "camera[1].count", "missing"),
+        ("[camera]\nkind = 'fish'", "camera.kind", "perspective"),
+        ("[camera]\nwidth = 12.5", "camera.width", "whole number"),
+        ("[clipping]\nlower = [0, 0, 0]\nupper = [1, 1, 0]", "clipping", "lower < upper"),
+        ("[fit]\nloss = 'huber'", "fit.images", "[truth]"),
+        ("[fit]\nmax_steps = 0\n[truth]\nkind = 'window'", "fit.max_steps", "at least 1"),
+        ("[fit]\nloss = 'dssim'\n[truth]\nkind = 'window'", "fit.loss", "bfgs"),
+        ("[fit]\nheld_out = -1\n[truth]\nkind = 'window'", "fit.held_out", "indices"),
+        ("[fit.start]\nentries = 8\n[truth]\nkind = 'window'", "fit.start", "excludes [transfer]"),
+        ("[material]\nx = 1", "material", "known:"),
+    ],
+)
+def test_mistakes_in_a_table_are_named(text, key, hint):
+    line = refusal(BASE + text)
+    assert line.startswith(f"config.toml: {key}: ")
+    assert hint in line
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "hint"),
+    [
+        ("transfer.positions=[1,0]", "transfer.positions", "strictly increasing"),
+        ("transfer.positions=[0]", "transfer.positions", "too few"),
+        ("transfer.sigma_t=[1,-2]", "transfer.sigma_t", "entry 1 must be at least 0"),
+        ("transfer.sigma_t=[1,[1,2,3]]", "transfer.sigma_t", "mixture"),
+        ("transfer.sigma_t=[1]", "transfer.sigma_t", "1 entries"),
+        ("transfer.rgb=[[1,1,1],[1,1]]", "transfer.rgb[1]", "red, green, blue"),
+        ("transfer.kind=linea", "transfer.kind", "did you mean 'linear'?"),
+        ("transfer.kind=lut", "transfer.positions", "unknown key"),
+        ("volume.spacing=[1,1,0]", "volume.spacing", "mm along x, y, z"),
+        ("volume.path=nothing.mhd", "volume.path", "$JVR_DATA"),
+        ("background=[0,0,nan]", "background", "finite"),
+        ("optical=emission", "optical", "emission-only"),
+        ("volum.path=a.mhd", "volum", "did you mean 'volume'?"),
+    ],
+)
+def test_mistakes_on_the_command_line_are_named_as_such(change, key, hint):
+    line = refusal(BASE, LINEAR, change)
+    assert line.startswith(f"--set: {key}")
+    assert hint in line
+
+
+def test_an_override_without_value_is_refused():
+    assert "key=value" in refusal(BASE, "settings.step")
+
+
+def test_overrides_take_toml_values_and_plain_text():
+    made = config(BASE, "settings.step=0.25", "camera.eye=[9, 0, 0]", "optical=emission-only", "volume.source=a = b")
+    assert made.tables.settings.step == 0.25
+    assert made.tables.camera[0].eye == [9, 0, 0]
+    assert made.tables.optical == "emission-only"
+    assert made.tables.volume.source == "a = b"
+
+
+def test_overrides_reach_into_lists_and_replace_alternatives():
+    made = config(
+        BASE + "[[camera]]\n[[camera]]\nkind='orbit'\ncount=2\nfov_y=20\n", "camera.1.count=5", "camera[1].half_angle_tangent=0.3"
+    )
+    assert made.tables.camera[1].count == 5
+    assert made.tables.camera[1].fov_y is None
+    assert config(BASE, "volume.path=a.mhd").tables.volume.builtin is None
+    assert "index from 0 to 1" in refusal(BASE + "[[camera]]\n[[camera]]\n", "camera.2.width=4")
+
+
+def test_a_missing_volume_says_what_it_is_and_where_it_was_searched(tmp_path, monkeypatch):
+    monkeypatch.setenv("JVR_DATA", str(tmp_path / "elsewhere"))
+    text = BASE.replace('builtin = "demo"', 'path = "head/head.mhd"\nsource = "the head of Example, example.org/head"')
+    line = refusal(text)
+    assert "volume.path" in line
+    assert "the head of Example, example.org/head" in line
+    assert str(tmp_path / "elsewhere") in line
+
+
+def test_paths_are_searched_beside_the_configuration_then_in_the_data_folder(tmp_path, monkeypatch):
+    data, beside = tmp_path / "data", tmp_path / "configs"
+    for folder, value in ((data, 1.0), (beside, 2.0)):
+        folder.mkdir()
+        np.save(folder / "both.npy", np.full((3, 3, 3), value, np.float32))
+    np.save(data / "one.npy", np.full((3, 3, 3), 3.0, np.float32))
+    monkeypatch.setenv("JVR_DATA", str(data))
+    file = beside / "scene.toml"
+    file.write_text(
+        '[volume]\npath = "both.npy"\n'
+        + LINEAR.replace("transfer={", "[transfer]\n")
+        .replace("}", "")
+        .replace(",pos", "\npos")
+        .replace(",rgb", "\nrgb")
+        .replace(",sig", "\nsig")
+    )
+    assert float(build_scene(read_config(file)).volume.values[0, 0, 0]) == 2.0
+    assert float(build_scene(read_config(file, ["volume.path=one.npy"])).volume.values[0, 0, 0]) == 3.0
+    np.save(tmp_path / "one.npy", np.full((3, 3, 3), 4.0, np.float32))
+    monkeypatch.chdir(tmp_path)
+    assert float(build_scene(read_config(file, ["volume.path=one.npy"])).volume.values[0, 0, 0]) == 4.0
+
+
+def test_damaged_and_missing_files_are_one_line(tmp_path):
+    (tmp_path / "bad.toml").write_text("[volume\n")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    for name, hint in (
+        ("bad.toml", "not valid TOML"),
+        ("binary.toml", "not valid TOML"),
+        ("bda.toml", "did you mean 'bad.toml'?"),
+    ):
+        with pytest.raises(ConfigError, match=hint.replace("?", r"\?")) as caught:
+            read_config(tmp_path / name)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.toml")), ids=lambda p: p.stem)
+def test_every_shipped_configuration_is_valid(path):
+    made = read_config(path)
+    assert made.tables.volume.builtin or made.tables.volume.source
+
+
+def test_the_ct_head_protocol(data, monkeypatch):
+    monkeypatch.setenv("JVR_DATA", str(data))
+    made = read_config(CONFIGS / "real" / "ct_head.toml")
+    scene, cameras, settings = build(made)
+    volume, table = scene.volume, scene.transfer
+    assert (float(volume.values.min()), float(volume.values.max())) == (0.0, 1.0)
+    assert settings.step * float(volume.spacing.min()) == pytest.approx(1.0)
+    assert len(cameras) == 8
+    distances = [np.linalg.norm(c.world_from_camera[:3, 3] - volume.center) for c in cameras]
+    np.testing.assert_allclose(distances, 450, rtol=1e-5)
+    assert np.tan(np.radians(float(cameras[0].fov_y) / 2)) == pytest.approx(0.3, rel=1e-5)
+    s = np.linspace(0, 1, 256)
+    expected = 0.02 * np.exp(-0.5 * ((s - 0.4) / 0.05) ** 2) + 0.5 * np.clip((s - 0.47) / 0.1, 0, 1)
+    np.testing.assert_allclose(table.sigma_t, expected, atol=1e-6)
+    assert table.rgb.shape == (256, 3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "width", "height"), [("perspective", 64, 48), ("perspective", 40, 64), ("orthographic", 64, 64)]
+)
+def test_an_automatic_camera_shows_the_whole_volume_and_little_more(kind, width, height):
+    scene, (camera,), _ = build(config(BASE, f"camera={{kind='{kind}',width={width},height={height}}}"))
+    rays, _ = enter(scene, *camera.rays(jnp.arange(width * height)))
+    hit = np.asarray(rays.length > 0).reshape(height, width)
+    assert not np.concatenate([hit[0], hit[-1], hit[:, 0], hit[:, -1]]).any()
+    assert max(np.mean(hit.any(axis=0)), np.mean(hit.any(axis=1))) > 0.75
+
+
+def test_scaling_maps_a_range_to_the_unit_interval():
+    volume = build_scene(config(BASE, "volume.scale=[0.2, 0.6]")).volume
+    before = build_scene(config(BASE)).volume
+    np.testing.assert_allclose(volume.values, np.clip((np.asarray(before.values) - 0.2) / 0.4, 0, 1), atol=1e-6)
+
+
+def test_names_become_objects():
+    made = config(
+        BASE + "[truth]\nkind = 'window'\n[fit]\n",
+        "settings.adjoint=rows",
+        "volume.interpolation=nearest",
+        "camera.width=8",
+        "camera.height=8",
+        "fit.unknowns=['transfer.sigma_t']",
+        "fit.loss=huber",
+        "fit.priors={sparsity=0.1}",
+        "fit.solver=dogleg",
+    )
+    job = build_fit(made)
+    assert isinstance(job.keywords["settings"].adjoint, jvr.Rows)
+    assert isinstance(job.scene.volume.interpolation, jvr.Nearest)
+    assert job.keywords["loss"] == jvr.Huber(0.05)
+    assert job.keywords["priors"] == (jvr.Sparsity(0.1),)
+    assert job.keywords["unknowns"](job.scene)[0] is job.scene.transfer.sigma_t
+    assert len(job.targets) == 1
+
+
+@pytest.mark.parametrize(("name", "hint"), [("transfer.sigma", "did you mean 'transfer.sigma_t'?"), ("light", "known:")])
+def test_an_unknown_that_is_none_is_refused(name, hint):
+    with pytest.raises(ConfigError, match=r"fit\.unknowns") as caught:
+        build_fit(config(BASE + f"[truth]\nkind = 'window'\n[fit]\nunknowns = ['{name}']\n"))
+    assert hint in str(caught.value)
+
+
+def test_held_out_views_are_new_views():
+    text = BASE + "[truth]\nkind='window'\n[camera]\nkind='fibonacci'\ncount=4\nwidth=6\nheight=6\n"
+    job = build_fit(config(text + "[fit]\nheld_out=3\n"))
+    assert job.held_out is not None
+    assert (len(job.cameras), len(job.held_out[0])) == (4, 3)
+    eyes = [np.asarray(c.world_from_camera)[:3, 3] for c in (*job.cameras, *job.held_out[0])]
+    gaps = [np.linalg.norm(a - b) for i, a in enumerate(eyes) for b in eyes[:i]]
+    assert min(gaps) > 0.1 * np.linalg.norm(eyes[0])
+    chosen = build_fit(config(text + "[fit]\nheld_out=[1]\n"))
+    assert chosen.held_out is not None
+    assert (len(chosen.cameras), len(chosen.held_out[0])) == (3, 1)
+
+
+def random_transfers():
+    rng = np.random.default_rng(0)
+    exact = lambda *shape: rng.random(shape, np.float32) * np.float32(10.0) ** rng.integers(-8, 8, shape).astype(np.float32)
+    grey, coloured = exact(40), exact(40, 3)
+    positions = np.unique(exact(60))[:40]
+    yield jvr.LinearTransfer(positions, exact(40, 3), grey)
+    yield jvr.LutTransfer(exact(40, 3), coloured, [-1024.7, 3071.3])
+    yield jvr.GaussianTransfer(exact(5), exact(5) + np.float32(1e-9), exact(5, 3), exact(5, 3))
+
+
+@pytest.mark.parametrize("transfer", list(random_transfers()), ids=lambda t: type(t).__name__)
+def test_a_transfer_function_survives_a_file_bit_by_bit(transfer, tmp_path):
+    write_transfer(tmp_path / "t.toml", transfer)
+    found = read_transfer(tmp_path / "t.toml")
+    assert jax.tree.structure(found) == jax.tree.structure(transfer)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(transfer), strict=True):
+        assert a.dtype == b.dtype
+        assert jnp.array_equal(a, b)
+    assert [p.name for p in tmp_path.iterdir()] == ["t.toml"]
+
+
+def test_a_configuration_can_name_a_transfer_file(tmp_path):
+    transfer = jvr.LinearTransfer([0.0, 0.5], [[0, 0, 0], [1, 0.5, 0.1]], [0.0, 0.3])
+    write_transfer(tmp_path / "t.toml", transfer)
+    made = config(BASE, f"transfer={{kind='file',path='{tmp_path / 't.toml'}'}}")
+    assert jnp.array_equal(build_scene(made).transfer.rgb, transfer.rgb)
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        (
+            "kind = 'linear'\npositions = [0, 1]\nrgb = [[1,1,1],[1,1,1]]\nsigma = [1, 1]",
+            "sigma: unknown key; did you mean 'sigma_t'?",
+        ),
+        ("kind = 'window'", "needs window, level and sigma_t"),
+        ("kind = 'file'\npath = 'x'", "cannot name another file"),
+        ("kind =", "not valid TOML"),
+    ],
+)
+def test_a_transfer_file_that_is_wrong_is_one_line(text, hint, tmp_path):
+    (tmp_path / "t.toml").write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        read_transfer(tmp_path / "t.toml")
+    assert str(caught.value).startswith(str(tmp_path / "t.toml"))
+    assert hint in str(caught.value)
