@@ -203,8 +203,8 @@ def test_tiles_and_shrinking_batches_change_nothing(monkeypatch):
     for smallest_batch, tile in ((100, 1000), (1000, 130)):
         image, other = both(smallest_batch, tile)
         for a, b in zip(jax.tree.leaves(image), jax.tree.leaves(whole), strict=True):
-            # Programs for batches of other sizes round differently. Entry and exit are distances near 30, so that a chord is good to
-            # 6e-6 and its optical depth here to 1e-5.
+            # Programs for batches of other sizes round differently. Entry and exit are distances near 30, so that a chord is
+            # good to 6e-6 and its optical depth here to 1e-5.
             np.testing.assert_allclose(a, b, rtol=2e-5, atol=3e-5)
         # Sums of hundreds of terms of both signs, in another order.
         np.testing.assert_allclose(other, gradient, atol=2e-5 * np.abs(gradient).max())

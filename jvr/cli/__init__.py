@@ -20,13 +20,15 @@ def run(arguments: Sequence[str]) -> int:
     # The public name of their common base class differs between versions of typer.
     usage_error: Any = typer.BadParameter.__mro__[1]
     from jvr.cli.app import app
-    from jvr.cli.inputs import BadInput, explain, usage_problem
+    from jvr.cli.inputs import BadInput, Interrupted, explain, usage_problem
 
     try:
         status = app(list(arguments) or ["--help"], prog_name="jvr", standalone_mode=False)
         return status if isinstance(status, int) else 0
     except BadInput as error:
         return explain(str(error), 2)
+    except Interrupted as error:
+        return explain(str(error), 1)
     except (typer.Abort, KeyboardInterrupt):
         return explain("interrupted", 1)
     except usage_error as error:

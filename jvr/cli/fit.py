@@ -2,7 +2,6 @@
 
 import json
 import shlex
-import sys
 import time
 import traceback
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jvr.cli.inputs import BadInput, explain, reading
+from jvr.cli.inputs import BadInput, Interrupted, reading
 from jvr.cli.runtime import nested, plain, progress, provenance, use_compilation_cache
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
 
@@ -52,9 +51,9 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
         checkpoint.unlink(missing_ok=True)
     try:
         return fit(job.scene, job.cameras, job.targets, **keywords)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         kept = f"{checkpoint} is kept, --resume goes on from it" if checkpoint.exists() else "no step was finished"
-        sys.exit(explain(f"interrupted: {kept}", 1))
+        raise Interrupted(f"interrupted: {kept}") from error
     except ValueError as error:
         if not _refused_by_jvr(error):
             raise

@@ -18,6 +18,10 @@ class BadInput(Exception):
     """Input that cannot be used; the message is the line that the person sees."""
 
 
+class Interrupted(Exception):
+    """Ctrl-C; the message says what was kept."""
+
+
 @contextlib.contextmanager
 def reading() -> Iterator[None]:
     """A stage that only reads and checks input: what it raises is the input's fault. Warnings become lines on stderr."""
