@@ -1,12 +1,17 @@
 """Reverse mode through a march, by replaying it.
 
-The march is walked a second time, front to back. With `R` the radiance still to come, `R <- R - T e` at each segment, and
+The segments of every ray are walked a second time, back to front, so that nothing is stored for a step. With `B` the radiance from
+behind a segment as it leaves the next one, `B <- e + exp(-dtau) B`, and `T` the transmittance in front of the segment,
 
-    dL/de = T,    dL/d(dtau) = -R  (after the segment),    d(tau)/d(dtau) = 1,
+    dL/de = T,    dL/d(dtau) = -T exp(-dtau) B,    d(tau)/d(dtau) = 1.
 
-so that no state is stored for any step and nothing is divided by a transparency that may be zero. What a segment's `e` and `dtau`
-depend on is left to automatic differentiation of that one segment. `R` starts from the unevaluated two-float sum of the forward
-march: in plain floats, entries deep behind a bright front would be lost in its rounding.
+Nothing is divided by a transparency that may be zero, and nothing is found as the difference of two large numbers: `B` is a sum of
+what was emitted, so entries deep behind a bright front keep their digits. (Walking front to back and subtracting each contribution
+from the final radiance loses them: the compiler need not round both walks alike.) The optical depth in front of a segment is that in
+front of the next one less its own; the march ends where `T` underflows, so these differences stay small, and the last segment,
+which may be arbitrarily opaque, is given its own depth by the forward march.
+
+What a segment's `e` and `dtau` depend on is left to automatic differentiation of that one segment.
 """
 
 import functools
@@ -18,24 +23,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jvr.march.batch import shrinking_while
-from jvr.march.march import (
-    Lanes,
-    Marched,
-    MarchOptions,
-    Medium,
-    Sums,
-    add_segment,
-    add,
-    integrate,
-    join,
-    march,
-    marched,
-    opacity,
-    through,
-    transmittance,
-)
+from jvr.march.march import Marched, MarchOptions, Medium, add, integrate, march, marched, opacity, through, transmittance
 from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.march.table import deposit_entries, split_entries
+from jvr.numerics import one_minus_exp
 from jvr.types import Channels, Scalar
 
 
@@ -48,20 +39,19 @@ def _replay_forward(options: MarchOptions, *arguments: Any):
     is_primal = lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
     inputs = jax.tree.map(lambda x: x.value, arguments, is_leaf=is_primal)
     perturbed = jax.tree.map(lambda x: x.perturbed and eqx.is_inexact_array(x.value), arguments, is_leaf=is_primal)
-    sums, steps = integrate(options, *inputs)
+    lanes = integrate(options, *inputs)
     # What is perturbed is known by which half of the inputs a leaf is in: a None in `wanted` asks for no derivative.
     wanted, fixed = eqx.partition(inputs, perturbed)
-    return marched(sums, steps), (wanted, fixed, sums, steps)
+    return marched(lanes), (wanted, fixed, lanes.steps, lanes.front)
 
 
 def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
-    wanted, fixed, sums, steps = residuals
     is_zero = lambda x: isinstance(x, jax.custom_derivatives.SymbolicZero)
     if all(map(is_zero, cotangent.distance)):
         # Nobody asks for the derivative of the distance: it is then not replayed either.
-        cotangent, sums = cotangent._replace(distance=()), sums._replace(distance=(), distance_low=())
+        cotangent = cotangent._replace(distance=())
     cotangent = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_zero(x) else x, cotangent, is_leaf=is_zero)
-    return replay(wanted, fixed, sums, steps, cotangent._replace(steps=None))
+    return replay(*residuals, cotangent._replace(steps=None))
 
 
 replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
@@ -69,49 +59,108 @@ replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
 Inputs = tuple[Medium, Rays, Scalar]
 
 
-class _ReplayLanes(NamedTuple):
-    """A ray while it is replayed: `lanes.sums` runs forward again, `remaining` is what is still to come (its radiance and distance;
-    optical depth is not used), `gradient` is with respect to the ray."""
+class Behind(NamedTuple):
+    """What a segment has behind it: radiance and opacity-weighted distance as they leave the next segment, and the optical depth from
+    the entry to there as a sum of two floats."""
 
-    lanes: Lanes
-    remaining: Sums
+    radiance: Channels
+    distance: Channels
+    tau: Channels
+    tau_low: Channels
+
+
+class BackLanes(NamedTuple):
+    """A ray while it is walked backwards. `front` is the optical depth in front of its last segment."""
+
+    rays: Rays
+    ray: Int[Array, "rays"]
+    count: Int[Array, "rays"]
+    steps: Int[Array, "rays"]
+    front: Channels
+    behind: Behind
+
+    def at(self, j: Int[Array, ""]) -> tuple[Int[Array, "rays"], Int[Array, "rays"]]:
+        """The index of the `j`-th segment from the back, and the number of segments, 0 for rays that are done."""
+        return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.count, 0)
+
+
+def back_lanes(rays: Rays, dt: Scalar, steps: Int[Array, "rays"], front: Channels, emits: int, *, distance: bool) -> BackLanes:
+    """Every ray at its last segment, with nothing behind it."""
+    zero = jnp.zeros_like(rays.length)
+    blank = (zero,) * len(front)
+    behind = Behind((zero,) * emits, blank * distance, front, blank)
+    return BackLanes(rays, jnp.arange(steps.size, dtype=jnp.int32), segment_count(rays.length, dt), steps, front, behind)
+
+
+def depth_in_front(lanes: BackLanes, j: Int[Array, ""], dtau: Channels) -> tuple[Channels, Channels]:
+    """Optical depth in front of the `j`-th segment from the back."""
+    tau, low = add(lanes.behind.tau, lanes.behind.tau_low, tuple(-d for d in dtau))
+    first = lambda given, found: tuple(jnp.where(j == 0, g, f) for g, f in zip(given, found, strict=True))
+    return first(lanes.front, tau), first((jnp.zeros(()),) * len(low), low)
+
+
+def step_back(
+    behind: Behind, front: tuple[Channels, Channels], emitted: Channels, dtau: Channels, u: Float[Array, "rays"]
+) -> Behind:
+    """What the segment in front has behind it."""
+    clear = tuple(jnp.exp(-d) for d in dtau)
+    radiance = tuple(e + b for e, b in zip(emitted, through(clear, behind.radiance), strict=True))
+    distance = tuple(one_minus_exp(d) * u + c * b for d, c, b in zip(dtau, clear, behind.distance, strict=False))
+    return Behind(radiance, distance, *front)
+
+
+def segment_cotangents(cotangent: Marched, behind: Behind, before: Channels, dtau: Channels, u: Float[Array, "rays"]):
+    """Cotangents of one segment's emission, optical depth and distance (the equations at the top of this file)."""
+    after = tuple(T * jnp.exp(-d) for T, d in zip(before, dtau, strict=True))
+    pulled = [-g * b for g, b in zip(cotangent.radiance, through(after, behind.radiance), strict=True)]
+    n = len(dtau)
+    to_dtau = [sum(pulled[c::n], cotangent.tau[c]) for c in range(n)]
+    to_u = jnp.zeros_like(u)
+    for c, (g, b) in enumerate(zip(cotangent.distance, behind.distance, strict=True)):
+        to_dtau[c] += g * after[c] * (u - b)
+        to_u += g * opacity(before, dtau)[c]
+    return through(before, cotangent.radiance), tuple(to_dtau), to_u
+
+
+class _ReplayState(NamedTuple):
+    """A ray while it is replayed, the cotangent of what it gathered, and the gradient with respect to the ray."""
+
+    lanes: BackLanes
     cotangent: Marched
     gradient: Any
 
 
 class _Gradients(NamedTuple):
-    """Gradients shared by all rays, and the index of the next segment."""
+    """Gradients shared by all rays, and the index of the next segment from the back."""
 
     medium: Any
     dt: Any
-    k: Int[Array, ""]
+    j: Int[Array, ""]
 
 
-def replay(wanted: Any, fixed: Any, sums: Sums, steps: Int[Array, "rays"], cotangent: Marched) -> Any:
+def replay(wanted: Any, fixed: Any, steps: Int[Array, "rays"], front: Channels, cotangent: Marched) -> Any:
     """The gradient of `<cotangent, march>` with respect to the leaves of `wanted` that are not `None`.
 
-    **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `sums`, `steps`: what the forward march ended with.
+    **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `steps`, `front`: of the forward march's `Lanes`.
     """
     medium, rays, dt = eqx.combine(wanted, fixed)
     zeros = functools.partial(jax.tree.map, jnp.zeros_like)
-    # Only the transmittance is needed on the way; radiance and distance are known from the forward march.
-    depths = zeros(Sums((), (), sums.tau, sums.tau_low, (), ()))
-    lanes = Lanes(rays, jnp.arange(steps.size, dtype=jnp.int32), segment_count(rays.length, dt), depths, steps)
+    lanes = back_lanes(rays, dt, steps, front, len(cotangent.radiance), distance=bool(cotangent.distance))
 
-    def alive(state: _ReplayLanes, total: _Gradients):
-        return total.k < state.lanes.steps
+    def alive(state: _ReplayState, total: _Gradients):
+        return total.j < state.lanes.steps
 
-    def advance(state: _ReplayLanes, total: _Gradients):
+    def advance(state: _ReplayState, total: _Gradients):
         return _replay_segment(medium, dt, state, total)
 
-    start = _ReplayLanes(lanes, sums._replace(tau=(), tau_low=()), cotangent, zeros(wanted[1]))
+    start = _ReplayState(lanes, cotangent, zeros(wanted[1]))
     final, total = shrinking_while(alive, advance, start, _Gradients(zeros(wanted[0]), zeros(wanted[2]), jnp.int32(0)))
     return total.medium, final.gradient, total.dt
 
 
-def _replay_segment(medium: Medium, dt: Scalar, state: _ReplayLanes, total: _Gradients):
-    lanes, k = state.lanes, total.k
-    count = jnp.where(k < lanes.steps, lanes.count, 0)
+def _replay_segment(medium: Medium, dt: Scalar, state: _ReplayState, total: _Gradients):
+    lanes, j = state.lanes, total.j
+    k, count = lanes.at(j)
     # Entries of a table are not among `small`: automatic differentiation would scatter each column by itself.
     rest_of_transfer, entries = split_entries(total.medium.transfer)
     small_mask = is_there((rest_of_transfer, total.medium.shader, state.gradient, total.dt))
@@ -131,10 +180,9 @@ def _replay_segment(medium: Medium, dt: Scalar, state: _ReplayLanes, total: _Gra
     no_taps = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), classified)
     (emitted, dtau, u), pull, (points, s) = jax.vjp(local, small, no_tap, no_taps, has_aux=True)
 
-    before = transmittance(lanes.sums)
-    remaining = subtract_segment(state.remaining, through(before, emitted), opacity(before, dtau), u)
-    cotangents = segment_cotangents(state.cotangent, remaining, before, dtau, u)
-    small_gradient, s_cotangent, entry_cotangent = pull(cotangents)
+    front = depth_in_front(lanes, j, dtau)
+    before = transmittance(*front)
+    small_gradient, s_cotangent, entry_cotangent = pull(segment_cotangents(state.cotangent, lanes.behind, before, dtau, u))
 
     rest_of_transfer, shader, ray_gradient, dt_gradient = jax.tree.map(
         jnp.add, (rest_of_transfer, total.medium.shader, state.gradient, total.dt), small_gradient
@@ -142,29 +190,10 @@ def _replay_segment(medium: Medium, dt: Scalar, state: _ReplayLanes, total: _Gra
     entries = deposit_entries(entries, medium.transfer, s, entry_cotangent)
     field = medium.field.deposit(total.medium.field, points, s_cotangent)
     medium_gradient = Medium(field, eqx.combine(rest_of_transfer, entries), shader)
-    lanes = lanes._replace(sums=add_segment(lanes.sums, (), dtau, u))
-    return _ReplayLanes(lanes, remaining, state.cotangent, ray_gradient), _Gradients(medium_gradient, dt_gradient, k + 1)
+    lanes = lanes._replace(behind=step_back(lanes.behind, front, emitted, dtau, u))
+    return _ReplayState(lanes, state.cotangent, ray_gradient), _Gradients(medium_gradient, dt_gradient, j + 1)
 
 
 def is_there(tree: Any) -> Any:
     """Which leaves of a tree are not `None`."""
     return jax.tree.map(lambda leaf: leaf is not None, tree, is_leaf=lambda leaf: leaf is None)
-
-
-def subtract_segment(remaining: Sums, emitted: Channels, opacities: Channels, u: Float[Array, "rays"]) -> Sums:
-    """What is still to come after a segment."""
-    radiance = add(remaining.radiance, remaining.radiance_low, tuple(-e for e in emitted))
-    nearer = tuple(-a * u for a in opacities) if remaining.distance else ()
-    return Sums(*radiance, (), (), *add(remaining.distance, remaining.distance_low, nearer))
-
-
-def segment_cotangents(cotangent: Marched, remaining: Sums, before: Channels, dtau: Channels, u: Float[Array, "rays"]):
-    """Cotangents of one segment's emission, optical depth and distance (the equations at the top of this file)."""
-    to_come = [-g * r for g, r in zip(cotangent.radiance, join(remaining.radiance, remaining.radiance_low), strict=True)]
-    n = len(dtau)
-    to_dtau = [sum(to_come[c::n], cotangent.tau[c]) for c in range(n)]
-    to_u = jnp.zeros_like(u)
-    for c, (g, r) in enumerate(zip(cotangent.distance, join(remaining.distance, remaining.distance_low), strict=True)):
-        to_dtau[c] += g * (u * before[c] * jnp.exp(-dtau[c]) - r)
-        to_u += g * opacity(before, dtau)[c]
-    return through(before, cotangent.radiance), tuple(to_dtau), to_u

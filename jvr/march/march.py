@@ -74,24 +74,26 @@ class Marched(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """The running state of a ray: radiance, optical depth and distance, each an unevaluated sum of two floats (see `two_sum`)."""
+    """The running state of a ray: radiance and optical depth as unevaluated sums of two floats (see `two_sum`), and the
+    opacity-weighted distance."""
 
     radiance: Channels
     radiance_low: Channels
     tau: Channels
     tau_low: Channels
     distance: Channels
-    distance_low: Channels
 
 
 class Lanes(NamedTuple):
-    """A ray while it marches: its index in the whole batch, its number of segments, its sums and the segments it took."""
+    """A ray while it marches: its index in the whole batch, its number of segments, its sums, the segments it took, and the optical
+    depth in front of the last of them."""
 
     rays: Rays
     ray: Int[Array, "rays"]
     count: Int[Array, "rays"]
     sums: Sums
     steps: Int[Array, "rays"]
+    front: Channels
 
 
 def march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
@@ -100,32 +102,33 @@ def march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marc
     Differentiable in forward mode as it stands; `jvr.march.adjoint` adds reverse mode. Detached: the number of segments and
     the decision to end a ray early.
     """
-    return marched(*integrate(options, medium, rays, dt))
+    return marched(integrate(options, medium, rays, dt))
 
 
-def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> tuple[Sums, Int[Array, "rays"]]:
-    """The final sums of every ray and the number of segments it took."""
+def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Lanes:
+    """Every ray at its end."""
     emits, absorbs = channel_counts(medium, rays, dt)
     zero = jnp.zeros_like(rays.length)
-    blank = lambda n: ((zero,) * n, (zero,) * n)
-    sums = Sums(*blank(emits), *blank(absorbs), *blank(absorbs * options.distance))
+    blank = (zero,) * absorbs
+    sums = Sums((zero,) * emits, (zero,) * emits, blank, blank, blank * options.distance)
     count = segment_count(rays.length, dt)
-    lanes = Lanes(rays, jnp.arange(zero.size, dtype=jnp.int32), count, sums, jnp.zeros_like(count))
+    lanes = Lanes(rays, jnp.arange(zero.size, dtype=jnp.int32), count, sums, jnp.zeros_like(count), blank)
 
     def advance(lanes: Lanes, k: Int[Array, ""]) -> tuple[Lanes, Int[Array, ""]]:
         alive = is_alive(options, lanes, k)
         emitted, dtau, u = take_segment(medium, lanes, dt, k, jnp.where(alive, lanes.count, 0))
-        return lanes._replace(sums=add_segment(lanes.sums, emitted, dtau, u), steps=lanes.steps + alive), k + 1
+        depth = join(lanes.sums.tau, lanes.sums.tau_low)
+        front = tuple(jnp.where(alive, now, last) for now, last in zip(depth, lanes.front, strict=True))
+        sums = add_segment(lanes.sums, emitted, dtau, u)
+        return lanes._replace(sums=sums, steps=lanes.steps + alive, front=front), k + 1
 
-    lanes, _ = shrinking_while(functools.partial(is_alive, options), advance, lanes, jnp.int32(0))
-    return lanes.sums, lanes.steps
+    return shrinking_while(functools.partial(is_alive, options), advance, lanes, jnp.int32(0))[0]
 
 
-def marched(sums: Sums, steps: Int[Array, "rays"]) -> Marched:
-    """The sums rounded to one float each."""
-    return Marched(
-        join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), join(sums.distance, sums.distance_low), steps
-    )
+def marched(lanes: Lanes) -> Marched:
+    """The sums of every ray, rounded to one float each."""
+    sums = lanes.sums
+    return Marched(join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), sums.distance, lanes.steps)
 
 
 def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, ""], count: Int[Array, "rays"]):
@@ -139,17 +142,17 @@ def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, ""], co
 
 def add_segment(sums: Sums, emitted: Channels, dtau: Channels, u: Float[Array, "rays"]) -> Sums:
     """One step of front-to-back compositing."""
-    before = transmittance(sums)
+    before = transmittance(sums.tau, sums.tau_low)
     radiance = add(sums.radiance, sums.radiance_low, through(before, emitted))
     tau = add(sums.tau, sums.tau_low, dtau)
-    # Where the distance is not asked for it is not computed.
-    further = tuple(a * u for a in opacity(before, dtau)) if sums.distance else ()
-    return Sums(*radiance, *tau, *add(sums.distance, sums.distance_low, further))
+    # Where the distance is not asked for, `sums.distance` is empty and nothing is computed.
+    distance = tuple(total + a * u for total, a in zip(sums.distance, opacity(before, dtau), strict=False))
+    return Sums(*radiance, *tau, distance)
 
 
-def transmittance(sums: Sums) -> Channels:
-    """Transmittance so far, from the optical depth and not as a running product, whose rounding errors would add up."""
-    return tuple(jnp.exp(-tau) for tau in join(sums.tau, sums.tau_low))
+def transmittance(tau: Channels, tau_low: Channels) -> Channels:
+    """Transmittance from the optical depth, and not as a running product, whose rounding errors would add up."""
+    return tuple(jnp.exp(-depth) for depth in join(tau, tau_low))
 
 
 def through(transmittances: Channels, emitted: Channels) -> Channels:
@@ -170,11 +173,13 @@ def opacity(before: Channels, dtau: Channels) -> Channels:
 
 
 def is_alive(options: MarchOptions, lanes: Lanes, k: Int[Array, ""]) -> Bool[Array, "rays"]:
-    """Whether segment `k` of each ray is still to be taken."""
+    """Whether segment `k` of each ray is still to be taken: it lies inside, and something of it can still reach the eye."""
     alive = k < lanes.count
-    if options.termination > 0 and lanes.sums.tau:
+    if lanes.sums.tau:
         thinnest = functools.reduce(jnp.minimum, lanes.sums.tau)
-        alive &= thinnest < -math.log(options.termination)
+        # Even without a bound: where the transmittance has underflowed to zero nothing more can be seen.
+        smallest = max(options.termination, float(jnp.finfo(thinnest.dtype).tiny))
+        alive &= thinnest < -math.log(smallest)
     return alive
 
 
@@ -188,10 +193,10 @@ def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:
 
 def add(high: Channels, low: Channels, terms: Channels) -> tuple[Channels, Channels]:
     """`two_sum` in every channel."""
-    sums = [two_sum(h, l, t) for h, l, t in zip(high, low, terms, strict=True)]
+    sums = [two_sum(h, low_, t) for h, low_, t in zip(high, low, terms, strict=True)]
     return tuple(s[0] for s in sums), tuple(s[1] for s in sums)
 
 
 def join(high: Channels, low: Channels) -> Channels:
     """Two-float sums rounded to one float."""
-    return tuple(h + l for h, l in zip(high, low, strict=True))
+    return tuple(h + low_ for h, low_ in zip(high, low, strict=True))

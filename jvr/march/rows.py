@@ -2,32 +2,21 @@
 
 Entry `p` has weight `hat_p(s) = max(0, 1 - |coordinate(s) - p|)` in a sample, so
 
-    dL_c / d rgb_p,c = sum_k hat_p(s_k) T_k de_k / d rgb,        dL_c / d sigma_p = sum_k hat_p(s_k) (T_k de_k - R_k ddtau_k) / d sigma,
+    dL_c / d rgb_p,c = sum_k hat_p(s_k) T_k de_k / d rgb,        dL_c / d sigma_p = sum_k hat_p(s_k) (T_k de_k - T_k+1 B_k+1 ddtau_k) / d sigma,
 
-with `R_k` the radiance still to come after segment `k`. Channel `c` of the radiance must depend on channel `c` of the colour alone.
+with `T_k` the transmittance in front of segment `k` and `B_k+1` the radiance from behind it (see `jvr.march.adjoint`). Channel `c` of the radiance must depend on channel `c` of the colour alone.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.adjoint import segment_cotangents, subtract_segment
+from jvr.march.adjoint import BackLanes, back_lanes, depth_in_front, segment_cotangents, step_back
 from jvr.march.batch import shrinking_while
-from jvr.march.march import (
-    Lanes,
-    Marched,
-    MarchOptions,
-    Medium,
-    add_segment,
-    integrate,
-    marched,
-    opacity,
-    through,
-    transmittance,
-)
-from jvr.march.steps import Rays, points_at, segment, segment_count
+from jvr.march.march import Marched, MarchOptions, Medium, integrate, marched, transmittance
+from jvr.march.steps import Rays, points_at, segment
 from jvr.types import Scalar
 
 # Segments whose contributions are added to the rows in one pass over memory: the rows are long, the segments short.
@@ -47,8 +36,7 @@ class TableRows(NamedTuple):
 
 
 class _RowLanes(NamedTuple):
-    lanes: Lanes
-    remaining: Any
+    lanes: BackLanes
     rows: TableRows
 
 
@@ -57,54 +45,46 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
 
     Distances have no rows. Memory: `rays x entries` numbers for each row that `TableRows` lists. Detached as in `march`.
     """
-    sums, steps = integrate(options, medium, rays, dt)
+    end = integrate(options, medium, rays, dt)
     n = medium.transfer.rgb.shape[0]
-    zero = jnp.zeros((steps.size, n), rays.length.dtype)
-    blank = TableRows((zero,) * len(sums.radiance), (zero,) * len(sums.radiance), (zero,) * len(sums.tau))
-    lanes = Lanes(
-        rays,
-        jnp.arange(steps.size, dtype=jnp.int32),
-        segment_count(rays.length, dt),
-        jax.tree.map(jnp.zeros_like, sums)._replace(distance=(), distance_low=()),
-        steps,
-    )
-    remaining = sums._replace(tau=(), tau_low=(), distance=(), distance_low=())
+    zero = jnp.zeros((end.steps.size, n), rays.length.dtype)
+    emits = len(end.sums.radiance)
+    blank = TableRows((zero,) * emits, (zero,) * emits, (zero,) * len(end.front))
+    lanes = back_lanes(rays, dt, end.steps, end.front, emits, distance=False)
 
-    def alive(state: _RowLanes, k: Int[Array, ""]):
-        return k < state.lanes.steps
+    def alive(state: _RowLanes, j: Int[Array, ""]):
+        return j < state.lanes.steps
 
-    def advance(state: _RowLanes, k: Int[Array, ""]):
-        def one(carry: tuple[Lanes, Any], i: Int[Array, ""]):
-            lanes, remaining, *sample = _row_segment(medium, dt, *carry, k + i)
-            return (lanes, remaining), sample
-
-        (lanes, remaining), (u, weights) = jax.lax.scan(one, (state.lanes, state.remaining), jnp.arange(BLOCK))
+    def advance(state: _RowLanes, j: Int[Array, ""]):
+        lanes, (u, weights) = jax.lax.scan(
+            lambda lanes, i: _row_segment(medium, dt, lanes, j + i), state.lanes, jnp.arange(BLOCK)
+        )
         entry = jnp.arange(n, dtype=u.dtype)
         hats = [jnp.maximum(0.0, 1.0 - jnp.abs(u[i][:, None] - entry)) for i in range(BLOCK)]
         rows = jax.tree.map(lambda row, w: row + sum(hats[i] * w[i][:, None] for i in range(BLOCK)), state.rows, weights)
-        return _RowLanes(lanes, remaining, rows), k + BLOCK
+        return _RowLanes(lanes, rows), j + BLOCK
 
-    final, _ = shrinking_while(alive, advance, _RowLanes(lanes, remaining, blank), jnp.int32(0))
-    return marched(sums, steps), final.rows
+    final, _ = shrinking_while(alive, advance, _RowLanes(lanes, blank), jnp.int32(0))
+    return marched(end), final.rows
 
 
-def _row_segment(medium: Medium, dt: Scalar, lanes: Lanes, remaining: Any, k: Int[Array, ""]):
-    """One segment of every ray: the state after it, where its samples fall in the table, and the weights of their hats."""
-    count = jnp.where(k < lanes.steps, lanes.count, 0)
+def _row_segment(medium: Medium, dt: Scalar, lanes: BackLanes, j: Int[Array, ""]) -> tuple[BackLanes, tuple[Array, TableRows]]:
+    """One segment of every ray: the state before it, where its samples fall in the table, and the weights of their hats."""
+    k, count = lanes.at(j)
     extent, distance = segment(k, count, lanes.rays.length, dt)
     points = points_at(lanes.rays, lanes.ray, k, distance)
     s = jax.vmap(medium.field.resample)(points)
     classified = jax.vmap(medium.transfer.evaluate)(s)
     (emitted, dtau), pull = jax.vjp(lambda c: jax.vmap(medium.shader.segment)(c, points, extent), classified)
-    before = transmittance(lanes.sums)
-    remaining = subtract_segment(remaining, through(before, emitted), opacity(before, dtau), distance)
+    front = depth_in_front(lanes, j, dtau)
+    before = transmittance(*front)
 
     radiance_rgb, radiance_sigma, tau_sigma = [], [], []
     zero = jnp.zeros_like(distance)
     nothing = Marched((zero,) * len(emitted), (zero,) * len(dtau), (), None)
     for c in range(len(emitted)):
         one = nothing._replace(radiance=_only(nothing.radiance, c))
-        (of_entry,) = pull(segment_cotangents(one, remaining, before, dtau, distance)[:2])
+        (of_entry,) = pull(segment_cotangents(one, lanes.behind, before, dtau, distance)[:2])
         radiance_rgb.append(of_entry.rgb[c])
         radiance_sigma.append(of_entry.sigma_t[c % len(of_entry.sigma_t)])
     for c in range(len(dtau)):
@@ -112,7 +92,7 @@ def _row_segment(medium: Medium, dt: Scalar, lanes: Lanes, remaining: Any, k: In
         tau_sigma.append(of_entry.sigma_t[c])
     weights = TableRows(tuple(radiance_rgb), tuple(radiance_sigma), tuple(tau_sigma))
     u = jax.vmap(medium.transfer.coordinate)(s)
-    return lanes._replace(sums=add_segment(lanes.sums, emitted, dtau, distance)), remaining, u, weights
+    return lanes._replace(behind=step_back(lanes.behind, front, emitted, dtau, distance)), (u, weights)
 
 
 def _only(channels: tuple[Array, ...], c: int) -> tuple[Array, ...]:

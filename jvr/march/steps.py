@@ -39,7 +39,7 @@ def segment_count(length: Float[Array, "rays"], dt: Scalar) -> Int[Array, "rays"
     return jnp.ceil(jax.lax.stop_gradient(length / dt)).astype(jnp.int32)
 
 
-def segment(k: Int[Array, ""], count: Int[Array, "rays"], length: Float[Array, "rays"], dt: Scalar):
+def segment(k: Int[Array, "..."], count: Int[Array, "rays"], length: Float[Array, "rays"], dt: Scalar):
     """Length of segment `k` of each ray, and the distance of its midpoint from the entry.
 
     Only the last segment's length depends on where the ray leaves. Past it the length is zero and the point stays at the exit,
@@ -51,7 +51,7 @@ def segment(k: Int[Array, ""], count: Int[Array, "rays"], length: Float[Array, "
     return extent, jnp.where(k < count, start + extent / 2, length)
 
 
-def points_at(rays: Rays, ray: Int[Array, "rays"], k: Int[Array, ""], u: Float[Array, "rays"]) -> Point:
+def points_at(rays: Rays, ray: Int[Array, "rays"], k: Int[Array, "..."], u: Float[Array, "rays"]) -> Point:
     """The batch of points at distance `u` from the entry."""
     p = tuple(e + u * d for e, d in zip(rays.entry, rays.direction, strict=True))
     return Point(p, ray, jnp.broadcast_to(k, u.shape))
