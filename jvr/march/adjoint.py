@@ -22,9 +22,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.batch import shrinking_while
-from jvr.march.march import Marched, MarchOptions, Medium, add, integrate, march, marched, opacity, through, transmittance
-from jvr.march.steps import Rays, points_at, segment, segment_count
+from jvr.march.batch import pooled_while
+from jvr.march.march import (
+    Lanes,
+    Marched,
+    MarchOptions,
+    Medium,
+    add,
+    integrate,
+    lanes_of,
+    march,
+    marched,
+    opacity,
+    through,
+    transmittance,
+)
+from jvr.march.steps import Rays, points_at, segment
 from jvr.march.table import deposit_entries, split_entries
 from jvr.numerics import one_minus_exp
 from jvr.types import Channels, Scalar
@@ -39,10 +52,10 @@ def _replay_forward(options: MarchOptions, *arguments: Any):
     is_primal = lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
     inputs = jax.tree.map(lambda x: x.value, arguments, is_leaf=is_primal)
     perturbed = jax.tree.map(lambda x: x.perturbed and eqx.is_inexact_array(x.value), arguments, is_leaf=is_primal)
-    lanes = integrate(options, *inputs)
+    end = integrate(options, *inputs)
     # What is perturbed is known by which half of the inputs a leaf is in: a None in `wanted` asks for no derivative.
     wanted, fixed = eqx.partition(inputs, perturbed)
-    return marched(lanes), (wanted, fixed, lanes.steps, lanes.front)
+    return marched(end), (wanted, fixed, end.steps, end.front)
 
 
 def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
@@ -70,33 +83,27 @@ class Behind(NamedTuple):
 
 
 class BackLanes(NamedTuple):
-    """A ray while it is walked backwards. `front` is the optical depth in front of its last segment."""
+    """A batch of rays that are walked backwards. `front` is the optical depth in front of the last segment."""
 
-    rays: Rays
-    ray: Int[Array, "rays"]
-    count: Int[Array, "rays"]
+    lanes: Lanes
     steps: Int[Array, "rays"]
     front: Channels
-    behind: Behind
 
-    def at(self, j: Int[Array, ""]) -> tuple[Int[Array, "rays"], Int[Array, "rays"]]:
+    def at(self, j: Int[Array, "rays"]) -> tuple[Int[Array, "rays"], Int[Array, "rays"]]:
         """The index of the `j`-th segment from the back, and the number of segments, 0 for rays that are done."""
-        return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.count, 0)
+        return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.lanes.count, 0)
 
+    def nothing_behind(self, emits: int, *, distance: bool) -> Behind:
+        """What the last segment has behind it."""
+        zero = jnp.zeros_like(self.lanes.rays.length)
+        blank = (zero,) * len(self.front)
+        return Behind((zero,) * emits, blank * distance, self.front, blank)
 
-def back_lanes(rays: Rays, dt: Scalar, steps: Int[Array, "rays"], front: Channels, emits: int, *, distance: bool) -> BackLanes:
-    """Every ray at its last segment, with nothing behind it."""
-    zero = jnp.zeros_like(rays.length)
-    blank = (zero,) * len(front)
-    behind = Behind((zero,) * emits, blank * distance, front, blank)
-    return BackLanes(rays, jnp.arange(steps.size, dtype=jnp.int32), segment_count(rays.length, dt), steps, front, behind)
-
-
-def depth_in_front(lanes: BackLanes, j: Int[Array, ""], dtau: Channels) -> tuple[Channels, Channels]:
-    """Optical depth in front of the `j`-th segment from the back."""
-    tau, low = add(lanes.behind.tau, lanes.behind.tau_low, tuple(-d for d in dtau))
-    first = lambda given, found: tuple(jnp.where(j == 0, g, f) for g, f in zip(given, found, strict=True))
-    return first(lanes.front, tau), first((jnp.zeros(()),) * len(low), low)
+    def depth(self, j: Int[Array, "rays"], behind: Behind, dtau: Channels) -> tuple[Channels, Channels]:
+        """Optical depth in front of the `j`-th segment from the back, whose own is `dtau`."""
+        tau, low = add(behind.tau, behind.tau_low, tuple(-d for d in dtau))
+        first = lambda given, found: tuple(jnp.where(j == 0, g, f) for g, f in zip(given, found, strict=True))
+        return first(self.front, tau), first((jnp.zeros(()),) * len(low), low)
 
 
 def step_back(
@@ -123,44 +130,48 @@ def segment_cotangents(cotangent: Marched, behind: Behind, before: Channels, dta
 
 
 class _ReplayState(NamedTuple):
-    """A ray while it is replayed, the cotangent of what it gathered, and the gradient with respect to the ray."""
+    """What a ray has behind it, how many segments were replayed, and the gradient with respect to the ray."""
 
-    lanes: BackLanes
-    cotangent: Marched
+    behind: Behind
+    j: Int[Array, "rays"]
     gradient: Any
 
 
 class _Gradients(NamedTuple):
-    """Gradients shared by all rays, and the index of the next segment from the back."""
+    """Gradients shared by all rays."""
 
     medium: Any
     dt: Any
-    j: Int[Array, ""]
 
 
 def replay(wanted: Any, fixed: Any, steps: Int[Array, "rays"], front: Channels, cotangent: Marched) -> Any:
     """The gradient of `<cotangent, march>` with respect to the leaves of `wanted` that are not `None`.
 
-    **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `steps`, `front`: of the forward march's `Lanes`.
+    **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `steps`, `front`: of the forward march's `Progress`.
     """
     medium, rays, dt = eqx.combine(wanted, fixed)
+    rays_mask = is_there(wanted[1])
     zeros = functools.partial(jax.tree.map, jnp.zeros_like)
-    lanes = back_lanes(rays, dt, steps, front, len(cotangent.radiance), distance=bool(cotangent.distance))
 
-    def alive(state: _ReplayState, total: _Gradients):
-        return total.j < state.lanes.steps
+    def start(inputs: tuple[BackLanes, Marched]) -> _ReplayState:
+        back, cotangent = inputs
+        behind = back.nothing_behind(len(cotangent.radiance), distance=bool(cotangent.distance))
+        return _ReplayState(behind, jnp.zeros_like(back.steps), zeros(eqx.filter(back.lanes.rays, rays_mask)))
 
-    def advance(state: _ReplayState, total: _Gradients):
-        return _replay_segment(medium, dt, state, total)
+    def alive(inputs: tuple[BackLanes, Marched], state: _ReplayState):
+        return state.j < inputs[0].steps
 
-    start = _ReplayState(lanes, cotangent, zeros(wanted[1]))
-    final, total = shrinking_while(alive, advance, start, _Gradients(zeros(wanted[0]), zeros(wanted[2]), jnp.int32(0)))
-    return total.medium, final.gradient, total.dt
+    def advance(inputs: tuple[BackLanes, Marched], state: _ReplayState, total: _Gradients):
+        return _replay_segment(medium, dt, *inputs, state, total)
+
+    inputs = (BackLanes(lanes_of(rays, dt), steps, front), cotangent)
+    total = _Gradients(zeros(wanted[0]), zeros(wanted[2]))
+    gradient, total = pooled_while(alive, advance, start, lambda state: state.gradient, inputs, total, steps)
+    return total.medium, gradient, total.dt
 
 
-def _replay_segment(medium: Medium, dt: Scalar, state: _ReplayState, total: _Gradients):
-    lanes, j = state.lanes, total.j
-    k, count = lanes.at(j)
+def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marched, state: _ReplayState, total: _Gradients):
+    lanes, (k, count) = back.lanes, back.at(state.j)
     # Entries of a table are not among `small`: automatic differentiation would scatter each column by itself.
     rest_of_transfer, entries = split_entries(total.medium.transfer)
     small_mask = is_there((rest_of_transfer, total.medium.shader, state.gradient, total.dt))
@@ -180,9 +191,9 @@ def _replay_segment(medium: Medium, dt: Scalar, state: _ReplayState, total: _Gra
     no_taps = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), classified)
     (emitted, dtau, u), pull, (points, s) = jax.vjp(local, small, no_tap, no_taps, has_aux=True)
 
-    front = depth_in_front(lanes, j, dtau)
+    front = back.depth(state.j, state.behind, dtau)
     before = transmittance(*front)
-    small_gradient, s_cotangent, entry_cotangent = pull(segment_cotangents(state.cotangent, lanes.behind, before, dtau, u))
+    small_gradient, s_cotangent, entry_cotangent = pull(segment_cotangents(cotangent, state.behind, before, dtau, u))
 
     rest_of_transfer, shader, ray_gradient, dt_gradient = jax.tree.map(
         jnp.add, (rest_of_transfer, total.medium.shader, state.gradient, total.dt), small_gradient
@@ -190,8 +201,8 @@ def _replay_segment(medium: Medium, dt: Scalar, state: _ReplayState, total: _Gra
     entries = deposit_entries(entries, medium.transfer, s, entry_cotangent)
     field = medium.field.deposit(total.medium.field, points, s_cotangent)
     medium_gradient = Medium(field, eqx.combine(rest_of_transfer, entries), shader)
-    lanes = lanes._replace(behind=step_back(lanes.behind, front, emitted, dtau, u))
-    return _ReplayState(lanes, state.cotangent, ray_gradient), _Gradients(medium_gradient, dt_gradient, j + 1)
+    behind = step_back(state.behind, front, emitted, dtau, u)
+    return _ReplayState(behind, state.j + (state.j < back.steps), ray_gradient), _Gradients(medium_gradient, dt_gradient)
 
 
 def is_there(tree: Any) -> Any:

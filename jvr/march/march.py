@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jvr.march.batch import shrinking_while
+from jvr.march.batch import pooled_while
 from jvr.march.steps import Point, Rays, points_at, segment, segment_count
 from jvr.model.transfer import AbstractTransfer, Classified
 from jvr.numerics import one_minus_exp, two_sum
@@ -85,12 +85,16 @@ class Sums(NamedTuple):
 
 
 class Lanes(NamedTuple):
-    """A ray while it marches: its index in the whole batch, its number of segments, its sums, the segments it took, and the optical
-    depth in front of the last of them."""
+    """A batch of rays: their indices in the whole batch and their numbers of segments."""
 
     rays: Rays
     ray: Int[Array, "rays"]
     count: Int[Array, "rays"]
+
+
+class Progress(NamedTuple):
+    """How far a ray has come: its sums, the segments it took, and the optical depth in front of the last of them."""
+
     sums: Sums
     steps: Int[Array, "rays"]
     front: Channels
@@ -105,33 +109,42 @@ def march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marc
     return marched(integrate(options, medium, rays, dt))
 
 
-def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Lanes:
+def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Progress:
     """Every ray at its end."""
     emits, absorbs = channel_counts(medium, rays, dt)
-    zero = jnp.zeros_like(rays.length)
-    blank = (zero,) * absorbs
-    sums = Sums((zero,) * emits, (zero,) * emits, blank, blank, blank * options.distance)
+
+    def start(lanes: Lanes) -> Progress:
+        zero = jnp.zeros_like(lanes.rays.length)
+        blank = (zero,) * absorbs
+        sums = Sums((zero,) * emits, (zero,) * emits, blank, blank, blank * options.distance)
+        return Progress(sums, jnp.zeros_like(lanes.count), blank)
+
+    def advance(lanes: Lanes, progress: Progress, _: None) -> tuple[Progress, None]:
+        alive = is_alive(options, lanes, progress)
+        sums = progress.sums
+        emitted, dtau, u = take_segment(medium, lanes, dt, progress.steps, jnp.where(alive, lanes.count, 0))
+        depth = join(sums.tau, sums.tau_low)
+        front = tuple(jnp.where(alive, now, last) for now, last in zip(depth, progress.front, strict=True))
+        return Progress(add_segment(sums, emitted, dtau, u), progress.steps + alive, front), None
+
+    lanes = lanes_of(rays, dt)
+    alive = functools.partial(is_alive, options)
+    return pooled_while(alive, advance, start, lambda progress: progress, lanes, None, lanes.count)[0]
+
+
+def lanes_of(rays: Rays, dt: Scalar) -> Lanes:
+    """All rays, numbered."""
     count = segment_count(rays.length, dt)
-    lanes = Lanes(rays, jnp.arange(zero.size, dtype=jnp.int32), count, sums, jnp.zeros_like(count), blank)
-
-    def advance(lanes: Lanes, k: Int[Array, ""]) -> tuple[Lanes, Int[Array, ""]]:
-        alive = is_alive(options, lanes, k)
-        emitted, dtau, u = take_segment(medium, lanes, dt, k, jnp.where(alive, lanes.count, 0))
-        depth = join(lanes.sums.tau, lanes.sums.tau_low)
-        front = tuple(jnp.where(alive, now, last) for now, last in zip(depth, lanes.front, strict=True))
-        sums = add_segment(lanes.sums, emitted, dtau, u)
-        return lanes._replace(sums=sums, steps=lanes.steps + alive, front=front), k + 1
-
-    return shrinking_while(functools.partial(is_alive, options), advance, lanes, jnp.int32(0))[0]
+    return Lanes(rays, jnp.arange(count.size, dtype=jnp.int32), count)
 
 
-def marched(lanes: Lanes) -> Marched:
+def marched(progress: Progress) -> Marched:
     """The sums of every ray, rounded to one float each."""
-    sums = lanes.sums
-    return Marched(join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), sums.distance, lanes.steps)
+    sums = progress.sums
+    return Marched(join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), sums.distance, progress.steps)
 
 
-def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, ""], count: Int[Array, "rays"]):
+def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
     """Emission and optical depth of segment `k` of every ray, and the distance of its midpoint; zero beyond `count`."""
     extent, u = segment(k, count, lanes.rays.length, dt)
     points = points_at(lanes.rays, lanes.ray, k, u)
@@ -172,11 +185,11 @@ def opacity(before: Channels, dtau: Channels) -> Channels:
     return tuple(T * one_minus_exp(d) for T, d in zip(before, dtau, strict=True))
 
 
-def is_alive(options: MarchOptions, lanes: Lanes, k: Int[Array, ""]) -> Bool[Array, "rays"]:
-    """Whether segment `k` of each ray is still to be taken: it lies inside, and something of it can still reach the eye."""
-    alive = k < lanes.count
-    if lanes.sums.tau:
-        thinnest = functools.reduce(jnp.minimum, lanes.sums.tau)
+def is_alive(options: MarchOptions, lanes: Lanes, progress: Progress) -> Bool[Array, "rays"]:
+    """Whether the next segment of each ray is to be taken: it lies inside, and something of it can still reach the eye."""
+    alive = progress.steps < lanes.count
+    if progress.sums.tau:
+        thinnest = functools.reduce(jnp.minimum, progress.sums.tau)
         # Even without a bound: where the transmittance has underflowed to zero nothing more can be seen.
         smallest = max(options.termination, float(jnp.finfo(thinnest.dtype).tiny))
         alive &= thinnest < -math.log(smallest)

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.adjoint import BackLanes, back_lanes, depth_in_front, segment_cotangents, step_back
-from jvr.march.batch import shrinking_while
-from jvr.march.march import Marched, MarchOptions, Medium, integrate, marched, transmittance
+from jvr.march.adjoint import BackLanes, Behind, segment_cotangents, step_back
+from jvr.march.batch import pooled_while
+from jvr.march.march import Marched, MarchOptions, Medium, integrate, lanes_of, marched, transmittance
 from jvr.march.steps import Rays, points_at, segment
 from jvr.types import Scalar
 
@@ -35,8 +35,9 @@ class TableRows(NamedTuple):
     tau_sigma: tuple[Float[Array, "rays n"], ...]
 
 
-class _RowLanes(NamedTuple):
-    lanes: BackLanes
+class _RowState(NamedTuple):
+    behind: Behind
+    j: Int[Array, "rays"]
     rows: TableRows
 
 
@@ -47,36 +48,38 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
     """
     end = integrate(options, medium, rays, dt)
     n = medium.transfer.rgb.shape[0]
-    zero = jnp.zeros((end.steps.size, n), rays.length.dtype)
-    emits = len(end.sums.radiance)
-    blank = TableRows((zero,) * emits, (zero,) * emits, (zero,) * len(end.front))
-    lanes = back_lanes(rays, dt, end.steps, end.front, emits, distance=False)
+    emits, absorbs = len(end.sums.radiance), len(end.front)
 
-    def alive(state: _RowLanes, j: Int[Array, ""]):
-        return j < state.lanes.steps
+    def start(back: BackLanes) -> _RowState:
+        zero = jnp.zeros((back.steps.size, n), rays.length.dtype)
+        rows = TableRows((zero,) * emits, (zero,) * emits, (zero,) * absorbs)
+        return _RowState(back.nothing_behind(emits, distance=False), jnp.zeros_like(back.steps), rows)
 
-    def advance(state: _RowLanes, j: Int[Array, ""]):
-        lanes, (u, weights) = jax.lax.scan(
-            lambda lanes, i: _row_segment(medium, dt, lanes, j + i), state.lanes, jnp.arange(BLOCK)
-        )
+    def alive(back: BackLanes, state: _RowState):
+        return state.j < back.steps
+
+    def advance(back: BackLanes, state: _RowState, _: None) -> tuple[_RowState, None]:
+        one = lambda carry, _: _row_segment(medium, dt, back, *carry)
+        (behind, j), (u, weights) = jax.lax.scan(one, (state.behind, state.j), length=BLOCK)
         entry = jnp.arange(n, dtype=u.dtype)
         hats = [jnp.maximum(0.0, 1.0 - jnp.abs(u[i][:, None] - entry)) for i in range(BLOCK)]
         rows = jax.tree.map(lambda row, w: row + sum(hats[i] * w[i][:, None] for i in range(BLOCK)), state.rows, weights)
-        return _RowLanes(lanes, rows), j + BLOCK
+        return _RowState(behind, j, rows), None
 
-    final, _ = shrinking_while(alive, advance, _RowLanes(lanes, blank), jnp.int32(0))
-    return marched(end), final.rows
+    back = BackLanes(lanes_of(rays, dt), end.steps, end.front)
+    rows, _ = pooled_while(alive, advance, start, lambda state: state.rows, back, None, end.steps)
+    return marched(end), rows
 
 
-def _row_segment(medium: Medium, dt: Scalar, lanes: BackLanes, j: Int[Array, ""]) -> tuple[BackLanes, tuple[Array, TableRows]]:
+def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, behind: Behind, j: Int[Array, "rays"]):
     """One segment of every ray: the state before it, where its samples fall in the table, and the weights of their hats."""
-    k, count = lanes.at(j)
+    lanes, (k, count) = back.lanes, back.at(j)
     extent, distance = segment(k, count, lanes.rays.length, dt)
     points = points_at(lanes.rays, lanes.ray, k, distance)
     s = jax.vmap(medium.field.resample)(points)
     classified = jax.vmap(medium.transfer.evaluate)(s)
     (emitted, dtau), pull = jax.vjp(lambda c: jax.vmap(medium.shader.segment)(c, points, extent), classified)
-    front = depth_in_front(lanes, j, dtau)
+    front = back.depth(j, behind, dtau)
     before = transmittance(*front)
 
     radiance_rgb, radiance_sigma, tau_sigma = [], [], []
@@ -84,7 +87,7 @@ def _row_segment(medium: Medium, dt: Scalar, lanes: BackLanes, j: Int[Array, ""]
     nothing = Marched((zero,) * len(emitted), (zero,) * len(dtau), (), None)
     for c in range(len(emitted)):
         one = nothing._replace(radiance=_only(nothing.radiance, c))
-        (of_entry,) = pull(segment_cotangents(one, lanes.behind, before, dtau, distance)[:2])
+        (of_entry,) = pull(segment_cotangents(one, behind, before, dtau, distance)[:2])
         radiance_rgb.append(of_entry.rgb[c])
         radiance_sigma.append(of_entry.sigma_t[c % len(of_entry.sigma_t)])
     for c in range(len(dtau)):
@@ -92,7 +95,7 @@ def _row_segment(medium: Medium, dt: Scalar, lanes: BackLanes, j: Int[Array, ""]
         tau_sigma.append(of_entry.sigma_t[c])
     weights = TableRows(tuple(radiance_rgb), tuple(radiance_sigma), tuple(tau_sigma))
     u = jax.vmap(medium.transfer.coordinate)(s)
-    return lanes._replace(behind=step_back(lanes.behind, front, emitted, dtau, distance)), (u, weights)
+    return (step_back(behind, front, emitted, dtau, distance), j + (j < back.steps)), (u, weights)
 
 
 def _only(channels: tuple[Array, ...], c: int) -> tuple[Array, ...]:
