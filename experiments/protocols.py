@@ -54,7 +54,7 @@ def ct_head_reference() -> jvr.LutTransfer:
     """256 entries: smooth colours; a Gaussian of skin and a ramp into bone, per millimetre."""
     x = np.linspace(0, 1, 256)
     rgb = np.stack([0.5 + 0.4 * np.sin(5 * x), 0.5 + 0.4 * np.cos(4 * x), 0.3 + 0.5 * x], axis=1)
-    sigma_t = 0.02 * np.exp(-np.square((x - 0.4) / 0.05)) + 0.5 * np.clip((x - 0.47) / 0.1, 0, 1)
+    sigma_t = 0.02 * np.exp(-0.5 * np.square((x - 0.4) / 0.05)) + 0.5 * np.clip((x - 0.47) / 0.1, 0, 1)
     return jvr.LutTransfer(rgb, sigma_t, (0.0, 1.0))
 
 

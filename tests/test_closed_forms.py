@@ -184,8 +184,8 @@ def test_error_of_early_termination_is_bounded_by_its_setting(termination):
     assert np.all(1 - np.asarray(ended.alpha)[short] <= termination * (1 + 1e-5))
 
 
-def test_tiles_and_shrinking_batches_change_nothing(monkeypatch):
-    """A batch that is halved twice on the way, against one that never is and against tiles that do not divide the picture."""
+def test_tiles_and_the_pool_change_nothing(monkeypatch):
+    """All rays at once, against a pool of lanes that is filled again on the way and against tiles that do not divide the picture."""
     volume = jvr.Volume(voxels(), OBLIQUE)
     camera = perspective(volume, 24, 20)
 
@@ -194,14 +194,14 @@ def test_tiles_and_shrinking_batches_change_nothing(monkeypatch):
         image = jvr.render(scene, camera, jvr.Settings(0.5, tile=tile))
         return jnp.sum(jnp.sin(3 * image.rgb)) + jnp.sum(image.alpha**2) + 0.1 * jnp.sum(image.depth), image
 
-    def both(smallest_batch, tile):
-        monkeypatch.setattr(batch, "SMALLEST_BATCH", smallest_batch)
+    def both(pool, tile):
+        monkeypatch.setattr(batch, "POOL", pool)
         (_, image), gradient = compiled(jax.value_and_grad(lambda v: loss(v, tile), has_aux=True))(volume.values)
         return image, gradient
 
     whole, gradient = both(1000, 1000)
-    for smallest_batch, tile in ((100, 1000), (1000, 130)):
-        image, other = both(smallest_batch, tile)
+    for pool, tile in ((100, 1000), (1000, 130)):
+        image, other = both(pool, tile)
         for a, b in zip(jax.tree.leaves(image), jax.tree.leaves(whole), strict=True):
             # Programs for batches of other sizes round differently. Entry and exit are distances near 30, so that a chord is
             # good to 6e-6 and its optical depth here to 1e-5.

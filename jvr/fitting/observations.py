@@ -38,7 +38,11 @@ class Observations(eqx.Module):
 
     def chunks(self, size: int) -> list["Observations"]:
         """Pieces of `size` rays."""
-        return [jax.tree.map(lambda x: x[i : i + size], self) for i in range(0, self.size, size)]
+        return [self.piece(i, size) for i in range(0, self.size, size)]
+
+    def piece(self, begin: int, size: int) -> "Observations":
+        """`size` rays from `begin` on."""
+        return jax.tree.map(lambda x: x[begin : begin + size], self)
 
 
 class Samples(eqx.Module):

@@ -8,8 +8,8 @@ behind a segment as it leaves the next one, `B <- e + exp(-dtau) B`, and `T` the
 Nothing is divided by a transparency that may be zero, and nothing is found as the difference of two large numbers: `B` is a sum of
 what was emitted, so entries deep behind a bright front keep their digits. (Walking front to back and subtracting each contribution
 from the final radiance loses them: the compiler need not round both walks alike.) The optical depth in front of a segment is that in
-front of the next one less its own; the march ends where `T` underflows, so these differences stay small, and the last segment,
-which may be arbitrarily opaque, is given its own depth by the forward march.
+front of the next one less its own. A segment may be arbitrarily opaque, which would leave no digit of such a difference: the forward
+march notes, for each channel, the depth in front of the last segment that can be seen through, and differences start there.
 
 What a segment's `e` and `dtau` depend on is left to automatic differentiation of that one segment.
 """
@@ -55,7 +55,7 @@ def _replay_forward(options: MarchOptions, *arguments: Any):
     end = integrate(options, *inputs)
     # What is perturbed is known by which half of the inputs a leaf is in: a None in `wanted` asks for no derivative.
     wanted, fixed = eqx.partition(inputs, perturbed)
-    return marched(end), (wanted, fixed, end.steps, end.front)
+    return marched(end), (wanted, fixed, end._replace(sums=None))
 
 
 def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
@@ -83,11 +83,12 @@ class Behind(NamedTuple):
 
 
 class BackLanes(NamedTuple):
-    """A batch of rays that are walked backwards. `front` is the optical depth in front of the last segment."""
+    """A batch of rays that are walked backwards; `steps`, `front` and `last` are those of the forward march's `Progress`."""
 
     lanes: Lanes
     steps: Int[Array, "rays"]
     front: Channels
+    last: tuple[Int[Array, "rays"], ...]
 
     def at(self, j: Int[Array, "rays"]) -> tuple[Int[Array, "rays"], Int[Array, "rays"]]:
         """The index of the `j`-th segment from the back, and the number of segments, 0 for rays that are done."""
@@ -100,10 +101,14 @@ class BackLanes(NamedTuple):
         return Behind((zero,) * emits, blank * distance, self.front, blank)
 
     def depth(self, j: Int[Array, "rays"], behind: Behind, dtau: Channels) -> tuple[Channels, Channels]:
-        """Optical depth in front of the `j`-th segment from the back, whose own is `dtau`."""
-        tau, low = add(behind.tau, behind.tau_low, tuple(-d for d in dtau))
-        first = lambda given, found: tuple(jnp.where(j == 0, g, f) for g, f in zip(given, found, strict=True))
-        return first(self.front, tau), first((jnp.zeros(()),) * len(low), low)
+        """Optical depth in front of the `j`-th segment from the back, whose own is `dtau`: infinite where nothing behind can be seen,
+        given where the forward march has noted it, else that in front of the next segment less its own."""
+        k = self.steps - 1 - j
+        depths = []
+        for i, tau in enumerate(zip(*add(behind.tau, behind.tau_low, tuple(-d for d in dtau)), strict=True)):
+            given = (jnp.where(k == self.last[i], self.front[i], jnp.inf), jnp.zeros_like(tau[1]))
+            depths.append([jnp.where(k < self.last[i], found, known) for found, known in zip(tau, given, strict=True)])
+        return tuple(high for high, _ in depths), tuple(low for _, low in depths)
 
 
 def step_back(
@@ -144,10 +149,10 @@ class _Gradients(NamedTuple):
     dt: Any
 
 
-def replay(wanted: Any, fixed: Any, steps: Int[Array, "rays"], front: Channels, cotangent: Marched) -> Any:
+def replay(wanted: Any, fixed: Any, end: Any, cotangent: Marched) -> Any:
     """The gradient of `<cotangent, march>` with respect to the leaves of `wanted` that are not `None`.
 
-    **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `steps`, `front`: of the forward march's `Progress`.
+    **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `end`: the forward march's `Progress`.
     """
     medium, rays, dt = eqx.combine(wanted, fixed)
     rays_mask = is_there(wanted[1])
@@ -164,9 +169,9 @@ def replay(wanted: Any, fixed: Any, steps: Int[Array, "rays"], front: Channels, 
     def advance(inputs: tuple[BackLanes, Marched], state: _ReplayState, total: _Gradients):
         return _replay_segment(medium, dt, *inputs, state, total)
 
-    inputs = (BackLanes(lanes_of(rays, dt), steps, front), cotangent)
+    inputs = (BackLanes(lanes_of(rays, dt), end.steps, end.front, end.last), cotangent)
     total = _Gradients(zeros(wanted[0]), zeros(wanted[2]))
-    gradient, total = pooled_while(alive, advance, start, lambda state: state.gradient, inputs, total, steps)
+    gradient, total = pooled_while(alive, advance, start, lambda state: state.gradient, inputs, total, end.steps)
     return total.medium, gradient, total.dt
 
 

@@ -8,7 +8,7 @@ import abc
 import dataclasses
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -93,11 +93,13 @@ class Lanes(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """How far a ray has come: its sums, the segments it took, and the optical depth in front of the last of them."""
+    """How far a ray has come: its sums, the segments it took and, for each channel of optical depth, the last segment that light
+    from behind could still reach the eye through (`last`), with the optical depth in front of it (`front`)."""
 
     sums: Sums
     steps: Int[Array, "rays"]
     front: Channels
+    last: tuple[Int[Array, "rays"], ...]
 
 
 def march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
@@ -117,15 +119,17 @@ def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> 
         zero = jnp.zeros_like(lanes.rays.length)
         blank = (zero,) * absorbs
         sums = Sums((zero,) * emits, (zero,) * emits, blank, blank, blank * options.distance)
-        return Progress(sums, jnp.zeros_like(lanes.count), blank)
+        return Progress(sums, jnp.zeros_like(lanes.count), blank, (jnp.zeros_like(lanes.count),) * absorbs)
 
     def advance(lanes: Lanes, progress: Progress, _: None) -> tuple[Progress, None]:
         alive = is_alive(options, lanes, progress)
         sums = progress.sums
         emitted, dtau, u = take_segment(medium, lanes, dt, progress.steps, jnp.where(alive, lanes.count, 0))
         depth = join(sums.tau, sums.tau_low)
-        front = tuple(jnp.where(alive, now, last) for now, last in zip(depth, progress.front, strict=True))
-        return Progress(add_segment(sums, emitted, dtau, u), progress.steps + alive, front), None
+        clear = [alive & (now < opaque_depth(now.dtype)) for now in depth]
+        front = tuple(jnp.where(c, now, old) for c, now, old in zip(clear, depth, progress.front, strict=True))
+        last = tuple(jnp.where(c, progress.steps, old) for c, old in zip(clear, progress.last, strict=True))
+        return Progress(add_segment(sums, emitted, dtau, u), progress.steps + alive, front, last), None
 
     lanes = lanes_of(rays, dt)
     alive = functools.partial(is_alive, options)
@@ -190,10 +194,15 @@ def is_alive(options: MarchOptions, lanes: Lanes, progress: Progress) -> Bool[Ar
     alive = progress.steps < lanes.count
     if progress.sums.tau:
         thinnest = functools.reduce(jnp.minimum, progress.sums.tau)
-        # Even without a bound: where the transmittance has underflowed to zero nothing more can be seen.
-        smallest = max(options.termination, float(jnp.finfo(thinnest.dtype).tiny))
-        alive &= thinnest < -math.log(smallest)
+        # Even without a bound: behind so much nothing can be seen.
+        bound = -math.log(options.termination) if options.termination > 0 else math.inf
+        alive &= thinnest < min(bound, opaque_depth(thinnest.dtype))
     return alive
+
+
+def opaque_depth(dtype: Any) -> float:
+    """The optical depth at which the transmittance underflows."""
+    return -math.log(float(jnp.finfo(dtype).tiny))
 
 
 def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:
