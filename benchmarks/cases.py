@@ -52,8 +52,8 @@ def gradient() -> dict[str, Any]:
     volume, settings = scenes.gyroid(), jvr.Settings(0.5)
     scene, camera = jvr.Scene(volume, scenes.opaque()), scenes.camera(volume, SIZE)
     image = jax.jit(lambda scene: jvr.render(scene, camera, settings))
-    entries = (scene.transfer.rgb, scene.transfer.sigma_t)
     into_entries = lambda s: (s.transfer.rgb, s.transfer.sigma_t)
+    entries = into_entries(scene)
     into_voxels = lambda s: s.volume.values
 
     def loss(unknown: Any, into: Any) -> jax.Array:
@@ -80,7 +80,9 @@ def memory() -> dict[str, Any]:
         def loss(unknown: Any) -> jax.Array:
             return jnp.mean(jvr.render(eqx.tree_at(into, scene, unknown), camera, jvr.Settings(step)).rgb)
 
-        return jax.jit(jax.value_and_grad(loss)).lower(unknown).compile().memory_analysis().temp_size_in_bytes
+        analysis = jax.jit(jax.value_and_grad(loss)).lower(unknown).compile().memory_analysis()
+        assert analysis is not None
+        return analysis.temp_size_in_bytes
 
     result: dict[str, Any] = {}
     for name, into in {"transfer": lambda s: s.transfer.sigma_t, "voxels": lambda s: s.volume.values}.items():
@@ -109,7 +111,7 @@ def fitting() -> dict[str, Any]:
     jax.block_until_ready(plain(through, rays, dt))
     unknowns = lambda s: (s.transfer.rgb, s.transfer.sigma_t)
     run = lambda: jvr.fit(start, cameras, images, settings=settings, unknowns=unknowns, progress=False)
-    run()
+    result = run()
     evaluations, to_60 = [], []
     for _ in range(3):
         began = time.perf_counter()

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 
 import jvr
-from jvr.march.march import Medium
 from jvr.march.steps import Rays
 
 
@@ -42,7 +41,7 @@ def vmapped_march(volume: jvr.Volume, transfer: jvr.LutTransfer, rays: Rays, dt:
     return jax.vmap(one)(jnp.stack(rays.entry, -1), jnp.stack(rays.direction, -1), rays.length)
 
 
-def kept_march(medium: Medium, rays: Rays, dt: Any) -> Any:
+def kept_march(medium: Any, rays: Rays, dt: Any) -> Any:
     """A plain structure-of-arrays forward march over kept samples: one `while_loop` over the batch, every ray to the longest end."""
     transfer = medium.transfer
     count = jnp.ceil(rays.length / dt).astype(jnp.int32)

@@ -93,7 +93,9 @@ def main() -> None:
         print(
             f"{line['method']:<40}{line['held_out_psnr']:>8.2f}{line['held_out_ssim']:>9.5f}{line['steps']:>7}{line['seconds']:>9.1f}"
         )
-    starts = random_starts(ct_head(size=64), 3 if arguments.quick else 20)
+    small = ct_head(size=64)
+    assert small is not None
+    starts = random_starts(small, 3 if arguments.quick else 20)
     print(f"recovered (held-out PSNR above {RECOVERED:g} dB) from {starts['recovered']:.0%} of {starts['starts']} random starts")
     if arguments.json:
         Path(arguments.json).write_text(json.dumps({"table": table, "random_starts": starts}, indent=2) + "\n")

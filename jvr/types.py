@@ -34,9 +34,10 @@ Image: TypeAlias = Float[Array, "height width 3"]
 
 # One component for each colour channel, or a single one that serves all three.
 Channels: TypeAlias = tuple[Float[Array, "..."], ...]
-Triple: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]
+# Three components. Not spelled out: a type checker cannot count what a comprehension makes.
+Triple: TypeAlias = tuple[Float[Array, "..."], ...]
 # Corners of a box, known when the program is compiled or traced.
-Corner: TypeAlias = Triple | tuple[float, float, float]
+Corner: TypeAlias = Triple | tuple[float, ...]
 
 
 class Outcome(enum.Enum):

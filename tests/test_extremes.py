@@ -67,12 +67,10 @@ def check(scene, camera, floor=1e-33, kink=False):
             continue
         for output, g, t in zip(OUTPUTS, gradient[name], true, strict=True):
             error, size, largest = np.abs(g - t), np.abs(t), np.abs(t).max()
-            if "transfer" in name or "background" in name:
-                # Each entry to its own size, and to a tenth of the largest one's last digit: terms of both signs add up.
-                allowed = 2e-4 * size + 1e-8 * largest
-            else:
-                # Sums of both signs over many samples, and over the picture.
-                allowed = 1e-4 * size + 2e-5 * largest
+            # Each entry to its own size, and to a tenth of the largest one's last digit: terms of both signs add up. Others are sums
+            # of both signs over many samples, and over the picture.
+            own = "transfer" in name or "background" in name
+            allowed = 2e-4 * size + 1e-8 * largest if own else 1e-4 * size + 2e-5 * largest
             if "fov" in name or "height_world" in name:
                 # The two sides of the picture cancel.
                 pose = next(k for k in true_gradient if "world_from_camera" in k)

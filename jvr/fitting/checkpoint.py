@@ -23,7 +23,8 @@ def save(path: Path, state: Any, history: list[dict[str, Any]], fingerprint: str
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, meta=np.array(meta), **{f"leaf{i}": leaf for i, leaf in enumerate(leaves)})
+            arrays: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
+            np.savez(file, meta=np.array(meta), **arrays)
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)

@@ -263,14 +263,15 @@ def _compare(problem: Problem, found: Exposed, cameras: Sequence[AbstractCamera]
         )
         rendered = np.stack(predict(problem, found, gathered, rays.length), axis=-1).reshape(target.shape)
         psnr = peak_signal_noise_ratio(target, rendered, data_range=1.0)
-        window = min(7, *target.shape[:2]) // 2 * 2 - 1 if min(target.shape[:2]) < 7 else 7
-        ssim = structural_similarity(target, rendered, data_range=1.0, channel_axis=-1, win_size=window)
+        # An odd window that fits into the smallest picture.
+        window = min(7, (min(target.shape[:2]) - 1) // 2 * 2 + 1)
+        ssim: Any = structural_similarity(target, rendered, data_range=1.0, channel_axis=-1, win_size=window)
         scores.append((float(psnr), float(ssim)))
     return tuple(scores)
 
 
 @contextlib.contextmanager
-def _progress(progress: Any, max_steps: int) -> Iterator[Callable[[Iteration], None]]:
+def _progress(progress: Any, max_steps: int) -> Iterator[Callable[[Iteration], Any]]:
     """A function to call after each iteration."""
     if callable(progress):
         yield progress

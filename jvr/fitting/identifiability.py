@@ -27,7 +27,7 @@ class Determination(NamedTuple):
 
 
 def determination(
-    matrix: Float[np.ndarray, "n n"], squares: float, measurements: int, epsilon: float = np.finfo(np.float32).eps
+    matrix: Float[np.ndarray, "n n"], squares: float, measurements: int, epsilon: float = float(np.finfo(np.float32).eps)
 ) -> Determination:
     """Standard errors of a weighted least-squares fit from its Gauss-Newton matrix `sum w J^T J` at the solution.
 

@@ -80,7 +80,7 @@ class DSSIM(eqx.Module):
         for axis in (0, 1):
             n = min(self.window, image.shape[axis])
             taps = [jnp.take(image, jnp.arange(i, image.shape[axis] - n + 1 + i), axis=axis) for i in range(n)]
-            image = sum(taps) / n
+            image = jnp.sum(jnp.stack(taps), axis=0) / n
         return image
 
 

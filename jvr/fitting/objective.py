@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior
+from jvr.fitting.losses import AbstractPrior
 from jvr.fitting.observations import Observations, Samples, observed_medium
 from jvr.fitting.unknowns import Exposed, Unknowns
 from jvr.march.differentiation import AbstractAdjoint, Forward, Replay
@@ -31,7 +31,7 @@ class Problem(eqx.Module):
     model: Exposed
     unknowns: Unknowns
     settings: Settings
-    loss: AbstractLoss | DSSIM
+    loss: Any  # AbstractLoss, or DSSIM for solvers that use gradients alone
     priors: tuple[AbstractPrior, ...]
     samples: Samples | None
 
@@ -94,7 +94,7 @@ def image_value(
         gathered, rays, _ = trace(model.scene, camera, settings, jnp.arange(camera.width * camera.height, dtype=jnp.int32))
         rendered = jnp.stack(predict(problem, model, gathered, rays.length), axis=-1).reshape(target.shape)
         losses.append(problem.loss.image(rendered, target))
-    return sum(losses) / len(losses) + prior(problem, model)
+    return jnp.mean(jnp.stack(losses)) + prior(problem, model)
 
 
 def prior(problem: Problem, model: Exposed) -> Scalar | float:

@@ -63,7 +63,7 @@ def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "ta
 
     **Raises** `ValueError` where their number or a size differs, or a pixel is not finite.
     """
-    images = [np.asarray(image, dtype=np.float32 if not jax.config.jax_enable_x64 else np.float64) for image in images]
+    images = [np.asarray(image, dtype=jnp.result_type(float)) for image in images]
     if len(images) != len(cameras) or not images:
         raise ValueError(
             f"there are {len(images)} images for {len(cameras)} cameras: give one image for each camera, and at least one"

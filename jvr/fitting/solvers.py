@@ -34,8 +34,8 @@ class Functions(NamedTuple):
     - `quadratic(real, normal)`: gradient and Gauss-Newton matrix on the real line, priors included, in float64.
     """
 
-    value: eqx.Module
-    residuals: eqx.Module
+    value: Any
+    residuals: Any
     levels: tuple[Callable[[Array], tuple[float, Normal]], ...]
     reach: np.ndarray
     quadratic: Callable[[np.ndarray, Normal], tuple[np.ndarray, np.ndarray]]
@@ -150,7 +150,7 @@ def _state(*fields: Any) -> ChunkedState:
     return ChunkedState(*jax.tree.map(np.asarray, fields))
 
 
-def _information(loss: Any, gradient: Any, matrix: Any) -> optx.FunctionInfo.EvalGradHessian:
+def _information(loss: Any, gradient: Any, matrix: Any) -> Any:
     operator = lx.MatrixLinearOperator(jnp.asarray(matrix), lx.positive_semidefinite_tag)
     return optx.FunctionInfo.EvalGradHessian(jnp.asarray(loss), jnp.asarray(gradient), operator)
 
@@ -194,7 +194,7 @@ class Scaled(eqx.Module):
     """An objective times a factor. Quasi-Newton methods leave out updates whose curvature is under the rounding of float32, which a
     mean over pixels starts out with; scaled by `unknowns / objective` at the start, a step of one changes it by about itself."""
 
-    function: eqx.Module
+    function: Any
     factor: Array
 
     def __call__(self, real: Float[Array, "n"], args: None) -> tuple[Array, None]:
@@ -255,7 +255,7 @@ class OptimistixSolver(AbstractGradientSolver):
     def step(self, functions: Functions, state: GradientState) -> GradientState:
         return _step(self.solver, self._function(functions, state.factor), state)
 
-    def _function(self, functions: Functions, factor: Array) -> eqx.Module:
+    def _function(self, functions: Functions, factor: Array) -> Callable[..., Any]:
         whole = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
         return functions.residuals if whole else Scaled(functions.value, factor)
 
@@ -300,7 +300,8 @@ class LBFGSB(AbstractGradientSolver):
         return _bounded_step(self.tol, self.history, Scaled(functions.value, state.factor), state, self._bounds(state.real))
 
     def _bounds(self, real: Array) -> tuple[Array, Array]:
-        return tuple(jnp.broadcast_to(jnp.asarray(b, real.dtype), real.shape) for b in (self.lower, self.upper))
+        spread = lambda bound: jnp.broadcast_to(jnp.asarray(bound, real.dtype), real.shape)
+        return spread(self.lower), spread(self.upper)
 
 
 def _jaxopt_solver(tol: float, history: int, fn: Any) -> Any:

@@ -175,7 +175,8 @@ def choose_unknowns(model: Exposed, select: Callable[[Exposed], Any], transforms
             )
         if not eqx.is_inexact_array(array):
             raise ValueError(
-                f"{_name(paths[place][0]).removeprefix('scene.')} has integer voxels, which cannot be fitted: convert them to floating point first"
+                f"{_name(paths[place][0]).removeprefix('scene.')} has integer voxels, which cannot be fitted: "
+                "convert them to floating point first"
             )
         places.append(place)
     if not places:

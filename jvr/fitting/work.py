@@ -140,7 +140,7 @@ def fingerprint(problem: Problem, observations: Observations, solver: Any) -> st
 
 def _total(observations: Observations) -> float:
     """Weighted number of residuals."""
-    return max(3 * float(jnp.sum(observations.weight)), np.finfo(np.float32).tiny)
+    return max(3 * float(jnp.sum(observations.weight)), float(np.finfo(np.float32).tiny))
 
 
 def _levels(problem: Problem, observations: Observations, chunk: int) -> tuple[Observations, ...]:

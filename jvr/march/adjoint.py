@@ -64,7 +64,8 @@ def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
         # Nobody asks for the derivative of the distance: it is then not replayed either.
         cotangent = cotangent._replace(distance=())
     cotangent = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_zero(x) else x, cotangent, is_leaf=is_zero)
-    return replay(*residuals, cotangent._replace(steps=None))
+    wanted, fixed, end = residuals
+    return replay(wanted, fixed, end, cotangent._replace(steps=None))
 
 
 replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
@@ -92,7 +93,7 @@ class BackLanes(NamedTuple):
 
     def at(self, j: Int[Array, "rays"]) -> tuple[Int[Array, "rays"], Int[Array, "rays"]]:
         """The index of the `j`-th segment from the back, and the number of segments, 0 for rays that are done."""
-        return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.lanes.count, 0)
+        return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.lanes.segments, 0)
 
     def nothing_behind(self, emits: int, *, distance: bool) -> Behind:
         """What the last segment has behind it."""

@@ -54,7 +54,7 @@ class Rows(AbstractAdjoint):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _rows_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
+def _rows_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Any:
     return march(options, medium, rays, dt)
 
 
@@ -75,7 +75,7 @@ def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[M
         tangent = rest if tangent is None else jax.tree.map(jnp.add, tangent, rest)
     elif tangent is None:
         tangent = jax.tree.map(jnp.zeros_like, primal._replace(steps=None))
-    steps = jax.custom_derivatives.zero_from_primal(primal.steps, symbolic_zeros=True)
+    steps: Any = jax.custom_derivatives.zero_from_primal(primal.steps, symbolic_zeros=True)
     return primal, tangent._replace(steps=steps)
 
 
@@ -108,7 +108,8 @@ def _times_rays(options: MarchOptions, primals: Inputs, tangents: Any) -> Marche
     def one(shared: Any, own: Any, fixed_own: Any):
         medium, dt = eqx.combine(shared, fixed)
         ray = jax.tree.map(lambda x: x[None], eqx.combine(own, fixed_own))
-        return jax.tree.map(lambda x: x[0], replay_march(options, medium, ray, dt)._replace(steps=None))
+        gathered: Marched = replay_march(options, medium, ray, dt)
+        return jax.tree.map(lambda x: x[0], gathered._replace(steps=None))
 
     jacobian = jax.vmap(jax.jacrev(one, argnums=(0, 1)), in_axes=(None, 0, 0))(shared, own, fixed_own)
 

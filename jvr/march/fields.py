@@ -1,5 +1,7 @@
 """The fields that rays can march through: voxels, resampled at every point, or samples kept from an earlier march."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,7 +21,7 @@ class VoxelField(AbstractField):
     def resample(self, point: Point) -> Scalar:
         return self.volume.sample(point.p)
 
-    def deposit(self, gradient: "VoxelField", points: Point, cotangent: Float[Array, "rays"]) -> "VoxelField":
+    def deposit(self, gradient: Any, points: Point, cotangent: Float[Array, "rays"]) -> Any:
         volume, total = self.volume, gradient.volume
         if total.values is not None:
             indices, weights = jax.vmap(lambda p: volume.interpolation.stencil(volume.shape, p))(points.p)
@@ -50,5 +52,5 @@ class KeptField(AbstractField):
         index = self.start[point.ray] + point.segment * self.stride
         return self.low + self.scale * self.stored.at[index].get(mode="clip").astype(self.low.dtype)
 
-    def deposit(self, gradient: "KeptField", points: Point, cotangent: Float[Array, "rays"]) -> "KeptField":
+    def deposit(self, gradient: Any, points: Point, cotangent: Float[Array, "rays"]) -> Any:
         return gradient

@@ -64,13 +64,13 @@ class Marched(NamedTuple):
 
     `radiance`: three components, or none where nothing is emitted; `tau`: optical depth, one or three components, or none;
     `distance`: opacity-weighted distance from the entry, not yet divided by the opacity, a component for each of `tau`, or none;
-    `steps`: segments taken.
+    `steps`: segments taken, `None` in a derivative.
     """
 
     radiance: Channels
     tau: Channels
     distance: Channels
-    steps: Int[Array, "rays"]
+    steps: Int[Array, "rays"] | None
 
 
 class Sums(NamedTuple):
@@ -89,7 +89,7 @@ class Lanes(NamedTuple):
 
     rays: Rays
     ray: Int[Array, "rays"]
-    count: Int[Array, "rays"]
+    segments: Int[Array, "rays"]
 
 
 class Progress(NamedTuple):
@@ -119,12 +119,12 @@ def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> 
         zero = jnp.zeros_like(lanes.rays.length)
         blank = (zero,) * absorbs
         sums = Sums((zero,) * emits, (zero,) * emits, blank, blank, blank * options.distance)
-        return Progress(sums, jnp.zeros_like(lanes.count), blank, (jnp.zeros_like(lanes.count),) * absorbs)
+        return Progress(sums, jnp.zeros_like(lanes.segments), blank, (jnp.zeros_like(lanes.segments),) * absorbs)
 
     def advance(lanes: Lanes, progress: Progress, _: None) -> tuple[Progress, None]:
         alive = is_alive(options, lanes, progress)
         sums = progress.sums
-        emitted, dtau, u = take_segment(medium, lanes, dt, progress.steps, jnp.where(alive, lanes.count, 0))
+        emitted, dtau, u = take_segment(medium, lanes, dt, progress.steps, jnp.where(alive, lanes.segments, 0))
         depth = join(sums.tau, sums.tau_low)
         clear = [alive & (now < opaque_depth(now.dtype)) for now in depth]
         front = tuple(jnp.where(c, now, old) for c, now, old in zip(clear, depth, progress.front, strict=True))
@@ -133,7 +133,7 @@ def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> 
 
     lanes = lanes_of(rays, dt)
     alive = functools.partial(is_alive, options)
-    return pooled_while(alive, advance, start, lambda progress: progress, lanes, None, lanes.count)[0]
+    return pooled_while(alive, advance, start, lambda progress: progress, lanes, None, lanes.segments)[0]
 
 
 def lanes_of(rays: Rays, dt: Scalar) -> Lanes:
@@ -191,7 +191,7 @@ def opacity(before: Channels, dtau: Channels) -> Channels:
 
 def is_alive(options: MarchOptions, lanes: Lanes, progress: Progress) -> Bool[Array, "rays"]:
     """Whether the next segment of each ray is to be taken: it lies inside, and something of it can still reach the eye."""
-    alive = progress.steps < lanes.count
+    alive = progress.steps < lanes.segments
     if progress.sums.tau:
         thinnest = functools.reduce(jnp.minimum, progress.sums.tau)
         # Even without a bound: behind so much nothing can be seen.

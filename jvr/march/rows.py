@@ -2,9 +2,11 @@
 
 Entry `p` has weight `hat_p(s) = max(0, 1 - |coordinate(s) - p|)` in a sample, so
 
-    dL_c / d rgb_p,c = sum_k hat_p(s_k) T_k de_k / d rgb,        dL_c / d sigma_p = sum_k hat_p(s_k) (T_k de_k - T_k+1 B_k+1 ddtau_k) / d sigma,
+    dL_c / d rgb_p,c = sum_k hat_p(s_k) T_k de_k / d rgb,
+    dL_c / d sigma_p = sum_k hat_p(s_k) (T_k de_k - T_k+1 B_k+1 ddtau_k) / d sigma,
 
-with `T_k` the transmittance in front of segment `k` and `B_k+1` the radiance from behind it (see `jvr.march.adjoint`). Channel `c` of the radiance must depend on channel `c` of the colour alone.
+with `T_k` the transmittance in front of segment `k` and `B_k+1` the radiance from behind it (see
+`jvr.march.adjoint`). Channel `c` of the radiance must depend on channel `c` of the colour alone.
 """
 
 from typing import NamedTuple
@@ -17,6 +19,7 @@ from jvr.march.adjoint import BackLanes, Behind, segment_cotangents, step_back
 from jvr.march.batch import pooled_while
 from jvr.march.march import Marched, MarchOptions, Medium, integrate, lanes_of, marched, transmittance
 from jvr.march.steps import Rays, points_at, segment
+from jvr.model.transfer import AbstractTable
 from jvr.types import Scalar
 
 # Segments whose contributions are added to the rows in one pass over memory: the rows are long, the segments short.
@@ -47,6 +50,7 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
     Distances have no rows. Memory: `rays x entries` numbers for each row that `TableRows` lists. Detached as in `march`.
     """
     end = integrate(options, medium, rays, dt)
+    assert isinstance(medium.transfer, AbstractTable)
     n = medium.transfer.rgb.shape[0]
     emits, absorbs = len(end.sums.radiance), len(end.front)
 
@@ -94,6 +98,7 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, behind: Behind, j:
         (of_entry,) = pull(((zero,) * len(emitted), _only(nothing.tau, c)))
         tau_sigma.append(of_entry.sigma_t[c])
     weights = TableRows(tuple(radiance_rgb), tuple(radiance_sigma), tuple(tau_sigma))
+    assert isinstance(medium.transfer, AbstractTable)
     u = jax.vmap(medium.transfer.coordinate)(s)
     return (step_back(behind, front, emitted, dtau, distance), j + (j < back.steps)), (u, weights)
 

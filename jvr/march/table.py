@@ -26,7 +26,9 @@ def deposit_entries(gradient: Any, table: AbstractTransfer, s: Float[Array, "ray
     Each sample touches the two entries around it. All channels go into one row: two scattered rows for each sample, and not two
     scattered numbers for each channel.
     """
-    wanted = [] if not isinstance(table, AbstractTable) else [gradient.rgb, gradient.sigma_t]
+    if not isinstance(table, AbstractTable):
+        return gradient
+    wanted = [gradient.rgb, gradient.sigma_t]
     columns = [c for entries, c in zip(wanted, cotangent, strict=False) if entries is not None]
     wanted = [entries for entries in wanted if entries is not None]
     if not wanted:

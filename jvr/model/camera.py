@@ -146,7 +146,9 @@ def _around(center: ArrayLike, radius: ArrayLike, offsets: list[Any], up: Array,
     for offset in offsets:
         # At the poles of the sphere z cannot point up in the picture; y then does.
         upward = jnp.where(jnp.abs(jnp.dot(jnp.asarray(offset), up)) > 0.999, jnp.roll(up, -1), up)
-        cameras.append(PerspectiveCamera.look_at(center + radius * jnp.asarray(offset), center, upward, fov_y, width, height))
+        cameras.append(
+            PerspectiveCamera.look_at(center + jnp.asarray(radius) * jnp.asarray(offset), center, upward, fov_y, width, height)
+        )
     return tuple(cameras)
 
 

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jvr.types import Affine, ArrayLike
@@ -32,7 +32,7 @@ def float_array(value: ArrayLike | Any, name: str, *shapes: tuple[int | None, ..
 
 def known(value: Any) -> np.ndarray | None:
     """The values of an array as NumPy, or `None` where a transformation of JAX is tracing it."""
-    return None if isinstance(value, jax.core.Tracer) else np.asarray(value)
+    return None if isinstance(value, Tracer) else np.asarray(value)
 
 
 def require(value: Any, condition: Any, message: str) -> None:

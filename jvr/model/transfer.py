@@ -25,6 +25,8 @@ class Classified(NamedTuple):
 class AbstractTransfer(eqx.Module):
     """A map from the scalar `s` (in the data's own units) to source colour and extinction."""
 
+    rgb: eqx.AbstractVar[Float[Array, "n 3"]]
+
     @abc.abstractmethod
     def evaluate(self, s: Scalar) -> Classified:
         """Colour and extinction at one scalar value; traceable and differentiable in `s` and in every array."""
@@ -33,7 +35,6 @@ class AbstractTransfer(eqx.Module):
 class AbstractTable(AbstractTransfer):
     """A transfer function that interpolates the rows of a table linearly, colour and extinction separately."""
 
-    rgb: eqx.AbstractVar[Float[Array, "n 3"]]
     sigma_t: eqx.AbstractVar[Float[Array, "..."]]
 
     @abc.abstractmethod

@@ -101,7 +101,8 @@ class Volume(eqx.Module):
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        return self.values.shape
+        nx, ny, nz = self.values.shape
+        return nx, ny, nz
 
     @property
     def spacing(self) -> Vector:
@@ -135,7 +136,8 @@ class Volume(eqx.Module):
         """The stored voxels interpolated at one grid position, before slope and intercept."""
         indices, weights = self.interpolation.stencil(self.shape, p)
         voxels = self.values.reshape(-1)
-        return sum(w * voxels.at[i].get(mode="promise_in_bounds").astype(w.dtype) for i, w in zip(indices, weights, strict=True))
+        read = lambda i, w: w * voxels.at[i].get(mode="promise_in_bounds").astype(w.dtype)
+        return sum((read(i, w) for i, w in zip(indices, weights, strict=True)), jnp.zeros_like(p[0]))
 
     def grid_from_world(self, x: Triple, *, direction: bool = False) -> Triple:
         """Grid position of a world position, or with `direction=True` grid displacement of a world displacement.
@@ -149,7 +151,7 @@ class Volume(eqx.Module):
         inverse = rows / (jnp.dot(a, rows[0]) * lengths[:, None])
         if not direction:
             x = tuple(x[i] - self.world_from_grid[i, 3] for i in range(3))
-        return tuple(sum(inverse[i, j] * x[j] for j in range(3)) for i in range(3))
+        return tuple(sum((inverse[i, j] * x[j] for j in range(3)), jnp.zeros_like(x[i])) for i in range(3))
 
 
 class ClippingBox(eqx.Module):

@@ -107,6 +107,7 @@ def _render_pixels(scene: Scene, camera: AbstractCamera, settings: Settings, pix
     rgb, alpha = composite(scene, gathered, rays.length)
     weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
     depth = jnp.where(alpha > 0, t_in + divide_or_zero(weighted, alpha), 0.0)
+    assert gathered.steps is not None
     return jnp.stack(rgb, axis=-1), alpha, depth, gathered.steps
 
 
