@@ -238,6 +238,7 @@ def test_voxels_are_found_by_a_first_order_solver():
     solver = optx.OptaxMinimiser(optax.adam(0.01), rtol=0.0, atol=0.0)
     result = fit(start, unknowns=lambda s: s.volume.values, solver=solver, max_steps=60)
     assert result.history[-1].loss < 0.02 * result.history[0].loss
+    assert np.all(np.isnan(result.standard_errors))
     with pytest.raises(ValueError, match="LBFGS"):
         fit(start, unknowns=lambda s: s.volume.values)
 

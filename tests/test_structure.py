@@ -32,7 +32,7 @@ HEAVY = (
 
 def _imports(path, top_level_only=False):
     """Names of the modules of `jvr` that a file imports."""
-    tree = ast.parse(path.read_text())
+    tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in tree.body if top_level_only else ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "jvr")

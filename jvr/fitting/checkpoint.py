@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -45,8 +46,9 @@ def load(path: Path, like: Any, fingerprint: str) -> tuple[Any, list[dict[str, A
     if meta["fingerprint"] != fingerprint:
         raise CheckpointError(f"{path}: written by a fit of another scene, images or settings: delete it to start anew")
     data, rest = eqx.partition(like, _is_data)
-    structure = jax.tree.structure(data)
-    return eqx.combine(jax.tree.unflatten(structure, leaves), rest), meta["history"]
+    old, structure = jax.tree.flatten(data)
+    new = [jnp.asarray(leaf) if eqx.is_array(before) else leaf for leaf, before in zip(leaves, old, strict=True)]
+    return eqx.combine(jax.tree.unflatten(structure, new), rest), meta["history"]
 
 
 def _is_data(leaf: Any) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 
 from jvr.fitting import checkpoint as checkpoints
-from jvr.fitting.identifiability import Determination
+from jvr.fitting.identifiability import Determination, undetermined
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.objective import Problem, march_unknowns, predict
 from jvr.fitting.observations import Observations, check_images, keep_samples, observe
@@ -68,7 +68,8 @@ class FitResult(NamedTuple):
 
     - `scene`: the fitted scene.
     - `history`: one `Iteration` for each step.
-    - `standard_errors`: of every fitted value, in the structure of `unknowns(scene)`; infinite where the images do not determine it.
+    - `standard_errors`: of every fitted value, in the structure of `unknowns(scene)`; infinite where the images do not determine it,
+      NaN for more unknowns than a Gauss-Newton matrix is made for (voxels).
     - `outcome`: how the iteration ended.
     - `exposure`: the fitted factor between rendered and target radiance, 1 where it was not asked for.
     - `stats`: `FitStats`.
@@ -160,7 +161,7 @@ def fit(
     real, _ = solver.iterate(state)
     values = chosen.values_from_real(jnp.asarray(real), model)
     found = chosen.insert(model, chosen.split(values, model))
-    known = work.determination(values)
+    known = work.determination(values) if march_unknowns(problem) <= MOST_FORWARD else undetermined(values.size)
     errors = chosen.split(jnp.asarray(known.standard_errors), model)
     selected, structure = jax.tree.flatten(unknowns(scene))
     stats = FitStats(

@@ -26,6 +26,12 @@ class Determination(NamedTuple):
     condition: float
 
 
+def undetermined(unknowns: int) -> Determination:
+    """What stands for the determination of unknowns that are too many for their Gauss-Newton matrix: nothing but NaN."""
+    nothing = np.full(unknowns, np.nan)
+    return Determination(nothing, float("nan"), 0, nothing, float("nan"))
+
+
 def determination(
     matrix: Float[np.ndarray, "n n"], squares: float, measurements: int, epsilon: float = float(np.finfo(np.float32).eps)
 ) -> Determination:
