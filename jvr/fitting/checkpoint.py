@@ -47,7 +47,7 @@ def load(path: Path, like: Any, fingerprint: str) -> tuple[Any, list[dict[str, A
         raise CheckpointError(f"{path}: written by a fit of another scene, images or settings: delete it to start anew")
     data, rest = eqx.partition(like, _is_data)
     old, structure = jax.tree.flatten(data)
-    new = [jnp.asarray(leaf) if eqx.is_array(before) else leaf for leaf, before in zip(leaves, old, strict=True)]
+    new = [jnp.asarray(leaf) if isinstance(before, jax.Array) else leaf for leaf, before in zip(leaves, old, strict=True)]
     return eqx.combine(jax.tree.unflatten(structure, new), rest), meta["history"]
 
 
