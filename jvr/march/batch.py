@@ -13,7 +13,7 @@ Shared = TypeVar("Shared")
 Results = TypeVar("Results")
 
 # Lanes in the pool: enough for every core to have work at each step, few enough for their state to stay in the cache.
-POOL = 12_288
+POOL = 8192
 # The share of lanes that may idle before they are filled again.
 IDLE = 0.25
 
