@@ -142,7 +142,7 @@ def startup() -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         picture = str(Path(folder) / "picture.png")
         config = str(Path(__file__).parents[1] / "configs" / "demo.toml")
-        command = (sys.executable, "-m", "jvr.cli", "render", config, "-o", picture, "--set", "camera.width=256")
+        command = (str(Path(sys.executable).with_name("jvr")), "render", config, "-o", picture, "--set", "camera.width=256")
         command += ("--set", "camera.height=256")
         cold = run(*command, XDG_CACHE_HOME=folder)
         warm = run(*command, XDG_CACHE_HOME=folder)

@@ -16,7 +16,7 @@ class Settings(eqx.Module):
     - `termination`: a ray ends once its transmittance is at most this, in every channel. What is behind could have added at most
       `termination` times the brightest radiance. 0 follows every ray to its end.
     - `adjoint`: how derivatives are computed: `jvr.Replay()` (reverse mode, default), `jvr.Forward()` or `jvr.Rows()`.
-    - `tile`: rays marched at a time. Memory in flight is about 300 bytes a ray; smaller tiles need less and take longer.
+    - `tile`: rays marched at a time. Memory is about 120 bytes a ray; smaller tiles need less and take longer.
 
     **Raises** `ValueError` for values out of range.
     """
