@@ -10,8 +10,11 @@ import pytest
 import jvr
 from jvr.fitting.fit import FitResult, FitStats, Iteration
 from jvr.io.images import srgb_from_linear
-from jvr.report.page import with_error, worst_in_words, write_fit_page
-from jvr.report.plots import comparison_strip, difference_factor, field_errors, plot_convergence, plot_transfer, png
+from jvr.report.errors import field_errors
+from jvr.report.page import write_fit_page
+from jvr.report.page.words import with_error, worst_in_words
+from jvr.report.plots import comparison_strip, plot_convergence, plot_transfer, png
+from jvr.report.plots.pictures import difference_factor
 
 N = 8
 RNG = np.random.default_rng(3)

@@ -1,10 +1,5 @@
-"""Figures of a fit: the transfer function with its uncertainty, the way there, and the pictures beside their targets.
+"""A transfer function with its uncertainty, beside the true one."""
 
-Every function returns a `matplotlib` figure that belongs to no window and to no global state; `png` turns one into a file's
-bytes. Colours are Okabe and Ito's, which colour-blind readers can tell apart, and no meaning rests on colour alone.
-"""
-
-import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,34 +9,19 @@ import numpy as np
 
 from jvr.io.images import srgb_from_linear
 from jvr.model.transfer import AbstractTable, AbstractTransfer, GaussianTransfer
+from jvr.report.errors import field_errors
+from jvr.report.plots.look import BLUE, GREEN, HATCH, INK, ORANGE, PALE, SOFT, WIDTH, style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from jvr.fitting.fit import Iteration
-
-INK, SOFT, PALE, GRID, HATCH = "#222222", "#6b6b6b", "#d9d9d9", "#ececec", "#b8b8b8"
-BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#009e73"
 CHANNELS = (("red", ORANGE, "o"), ("green", GREEN, "s"), ("blue", BLUE, "^"))
-WIDTH = 8.0
-TIMES = "\N{MULTIPLICATION SIGN}"
 UNDETERMINED = "not determined by the images"
 # Entries of a table are drawn as points up to this many; more would hide the line.
 MOST_POINTS = 80
-MOST_VIEWS = 6
 # Where a curve that is not a table is evaluated.
 SAMPLES = 512
-
-
-def png(figure: "Figure", dpi: int = 150) -> bytes:
-    """The figure as a PNG file."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
-    return buffer.getvalue()
-
-
-# --- Transfer function -----------------------------------------------------------------------------------------------
 
 
 class _Curve(NamedTuple):
@@ -50,34 +30,6 @@ class _Curve(NamedTuple):
     s: np.ndarray
     rgb: np.ndarray
     sigma_t: np.ndarray
-
-
-def field_errors(transfer: AbstractTransfer, standard_errors: Any) -> dict[str, np.ndarray]:
-    """Standard errors by the name of the transfer function's field: `rgb`, `sigma_t`, `positions`, `height`, ...
-
-    **Arguments:** `standard_errors`: a mapping from fields (`"rgb"` or `"transfer.rgb"`), a transfer function that holds errors
-    in place of values, or arrays in the structure that a fit's `unknowns` returned. Such arrays are told apart by their shapes:
-    all fields in their order, else `rgb` first and then extinction, so pass a mapping where `positions`, `center` or `width` were
-    fitted without the others. Arrays that fit no field are left out.
-    """
-    fields = {name: np.shape(value) for name, value in vars(transfer).items() if value is not None}
-    if standard_errors is None:
-        return {}
-    if isinstance(standard_errors, AbstractTransfer):
-        standard_errors = vars(standard_errors)
-    if isinstance(standard_errors, Mapping):
-        named = {name.rpartition(".")[2]: np.asarray(value) for name, value in standard_errors.items() if value is not None}
-        return {name: value for name, value in named.items() if fields.get(name) == value.shape}
-    arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(standard_errors)]
-    if [array.shape for array in arrays] == list(fields.values()):
-        return dict(zip(fields, arrays, strict=True))
-    likely = ("rgb", "sigma_t", "height", *fields)
-    found: dict[str, np.ndarray] = {}
-    for array in arrays:
-        name = next((name for name in likely if name not in found and fields.get(name) == array.shape), None)
-        if name:
-            found[name] = array
-    return found
 
 
 def plot_transfer(
@@ -161,17 +113,6 @@ def _undetermined(errors: np.ndarray | None) -> np.ndarray | None:
     return None if errors is None else np.logical_not(np.isfinite(errors).all(axis=-1))
 
 
-def _style(axes: "Axes", ylabel: str) -> None:
-    axes.set_ylabel(ylabel, color=INK)
-    axes.grid(True, color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=SOFT, labelsize=9)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(PALE)
-
-
 def _strip(axes: "Axes", name: str, transfer: AbstractTransfer, span: tuple[float, float]) -> None:
     colours = srgb_from_linear(_sampled(transfer, np.linspace(*span, SAMPLES)).rgb)
     axes.imshow(colours[None], extent=(*span, 0.0, 1.0), aspect="auto", interpolation="nearest")
@@ -196,7 +137,7 @@ def _hatch(axes: "Axes", s: np.ndarray, unknown: np.ndarray | None) -> None:
 def _extinction_panel(
     axes: "Axes", fitted: AbstractTransfer, found: _Curve, true: _Curve | None, errors: dict[str, np.ndarray]
 ) -> None:
-    _style(axes, "extinction\n(1 / world length)")
+    style(axes, "extinction\n(1 / world length)")
     spread = _extinction_errors(errors)
     grey = found.sigma_t.shape[1] == 1
     looks = (("fitted", BLUE, "o"),) if grey else tuple((f"fitted, {name}", colour, mark) for name, colour, mark in CHANNELS)
@@ -215,7 +156,7 @@ def _extinction_panel(
 def _colour_panel(
     axes: "Axes", fitted: AbstractTransfer, found: _Curve, true: _Curve | None, errors: dict[str, np.ndarray]
 ) -> None:
-    _style(axes, "colour\n(linear)")
+    style(axes, "colour\n(linear)")
     is_table = isinstance(fitted, AbstractTable)
     spread = errors.get("rgb") if is_table else None
     looks = tuple((name, colour, mark) for name, colour, mark in CHANNELS)
@@ -328,141 +269,3 @@ def _histogram(axes: "Axes", histogram: Any) -> None:
     behind.set_zorder(axes.get_zorder() - 1)
     axes.patch.set_visible(False)
     axes.text(0.995, 0.97, "grey: voxels, logarithmic", transform=axes.transAxes, ha="right", va="top", fontsize=8, color=SOFT)
-
-
-# --- Convergence -----------------------------------------------------------------------------------------------------
-
-
-def plot_convergence(history: Sequence["Iteration"]) -> "Figure":
-    """Objective (logarithmic) and PSNR against the iteration and against seconds.
-
-    Steps that used a part of the rays are hollow points on a grey ground, with the share written above.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH, 4.4), layout="constrained")
-    rows = figure.subplots(2, 2, sharex="col", sharey="row")
-    for row, label in zip(rows, ("objective", "PSNR (dB)"), strict=True):
-        _style(row[0], label)
-        _style(row[1], "")
-    for axes, label in zip(rows[1], ("iteration", "seconds"), strict=True):
-        axes.set_xlabel(label, color=INK)
-    if not history:
-        rows[0, 0].text(0.5, 0.5, "no iteration was made", transform=rows[0, 0].transAxes, ha="center", color=SOFT)
-        return figure
-    table = np.array([[entry.step, entry.seconds, entry.loss, entry.psnr, entry.rays] for entry in history], float)
-    step, seconds, loss, psnr, rays = table.T
-    # Neither zero nor infinity has a place on the axes.
-    loss, psnr = np.where(loss > 0, loss, np.nan), np.where(np.isfinite(psnr), psnr, np.nan)
-    if np.isfinite(loss).any():
-        rows[0, 0].set_yscale("log")
-    for column, x in enumerate((step, seconds)):
-        for axes, y, colour in zip(rows[:, column], (loss, psnr), (BLUE, ORANGE), strict=True):
-            axes.plot(x, y, color=colour, linewidth=1.6, zorder=3)
-            axes.scatter(x, y, s=18, color=colour, facecolors=np.where(rays < 1, "white", colour), zorder=4)
-            axes.margins(x=0.03)
-            _shade_shares(axes, x, rays)
-        _name_shares(rows[0, column], x, rays)
-    rows[1, 0].xaxis.get_major_locator().set_params(integer=True)
-    return figure
-
-
-def _stretches(x: np.ndarray, rays: np.ndarray) -> list[tuple[float, float, float]]:
-    """Start, end and share of rays of each run of steps with one share; empty where every step used all rays."""
-    starts = np.flatnonzero(np.diff(rays, prepend=np.nan) != 0)
-    middles = np.concatenate([x[:1], (x[1:] + x[:-1]) / 2, x[-1:]])
-    if np.all(rays >= 1):
-        return []
-    return [(float(middles[i]), float(middles[j]), float(rays[i])) for i, j in zip(starts, [*starts[1:], len(x)], strict=True)]
-
-
-def _shade_shares(axes: "Axes", x: np.ndarray, rays: np.ndarray) -> None:
-    for start, end, share in _stretches(x, rays):
-        if share < 1:
-            axes.axvspan(start, end, color=PALE, alpha=0.2 + 0.6 * (1 - share), linewidth=0, zorder=0)
-
-
-def _name_shares(axes: "Axes", x: np.ndarray, rays: np.ndarray) -> None:
-    """Writes the share of rays above each stretch that is wide enough for it."""
-    for start, end, share in _stretches(x, rays):
-        if end - start > 0.1 * np.ptp(x):
-            text = "all rays" if share >= 1 else f"{100 * share:.2g} %"
-            place = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom", "fontsize": 8, "color": SOFT}
-            axes.annotate(text, ((start + end) / 2, 1.02), **place)
-
-
-# --- Pictures --------------------------------------------------------------------------------------------------------
-
-
-def comparison_strip(targets: Sequence[Any], fitted: Sequence[Any], *, before: Sequence[Any] | None = None) -> "Figure":
-    """Targets, fitted images and their difference, one row for each view, at most six rows spread over the views.
-
-    Images are linear radiance `(height, width, 3)`, shown clipped to 0 ... 1 in sRGB. The difference is the largest of the three
-    channels' absolute differences, all rows to one scale, which the column's title states as a factor. `before`: images from
-    before the fit, as one more column.
-    """
-    from matplotlib.figure import Figure
-
-    check_pairs(targets, fitted, before)
-    shown = np.unique(np.linspace(0, len(targets) - 1, min(MOST_VIEWS, len(targets))).round().astype(int))
-    pairs = [(np.asarray(targets[i], np.float64), np.asarray(fitted[i], np.float64)) for i in shown]
-    differences = [np.abs(found - target).max(axis=-1) for target, found in pairs]
-    factor = difference_factor(differences)
-    titles = ["target", *(["before the fit"] if before is not None else []), "fitted", f"difference {TIMES} {factor:,}"]
-
-    # Beside the pictures: labels of the rows, titles and the colour bar.
-    width = (WIDTH - 0.5) / len(titles)
-    heights = [width * target.shape[0] / target.shape[1] for target, _ in pairs]
-    figure = Figure(figsize=(WIDTH, sum(heights) + 0.06 * len(heights) + 0.9), layout="constrained")
-    grid = figure.subplots(len(pairs), len(titles), squeeze=False, gridspec_kw={"height_ratios": heights})
-    mapped = None
-    for row, i, (target, found), difference in zip(grid, shown, pairs, differences, strict=True):
-        pictures = [target, *([np.asarray(before[i])] if before is not None else []), found]
-        for axes, picture in zip(row, pictures, strict=False):
-            axes.imshow(srgb_from_linear(np.nan_to_num(picture)), interpolation="nearest")
-        mapped = row[-1].imshow(difference, cmap="magma", vmin=0, vmax=1 / factor, interpolation="nearest")
-        row[0].set_ylabel(f"view {i + 1}\n{decibels(target, found)}", color=INK, fontsize=9)
-        for axes in row:
-            axes.set_xticks([])
-            axes.set_yticks([])
-            for spine in axes.spines.values():
-                spine.set_visible(False)
-    for axes, title in zip(grid[0], titles, strict=True):
-        axes.set_title(title, color=INK, fontsize=10)
-    if mapped is not None:
-        bar = figure.colorbar(mapped, ax=grid, location="bottom", shrink=0.5, aspect=40, pad=0.02)
-        bar.set_label("difference of radiance, largest of the three channels", color=INK, fontsize=9)
-        bar.ax.tick_params(colors=SOFT, labelsize=8)
-        bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    return figure
-
-
-def check_pairs(targets: Sequence[Any], *others: Sequence[Any] | None) -> None:
-    """**Raises** `ValueError` unless there is a target, and for each target one image of its shape among each of the others."""
-    if not len(targets):
-        raise ValueError("there are no target images: give at least one")
-    for images in others:
-        if images is None:
-            continue
-        if len(images) != len(targets):
-            raise ValueError(f"there are {len(targets)} targets and {len(images)} images to compare: give one for each")
-        for i, (target, image) in enumerate(zip(targets, images, strict=True)):
-            if np.shape(target) != np.shape(image):
-                raise ValueError(f"view {i + 1}: the target has shape {np.shape(target)}, the image {np.shape(image)}")
-
-
-def difference_factor(differences: Sequence[np.ndarray]) -> int:
-    """The factor (1, 2, 5, 10, 20, ..., a million at most) that makes nearly all differences of radiance at most 1."""
-    flat = np.concatenate([np.ravel(difference) for difference in differences])
-    flat = flat[np.isfinite(flat)]
-    high = float(np.quantile(flat, 0.995)) if flat.size else 0.0
-    steps = [digit * 10**power for power in range(6) for digit in (1, 2, 5)] + [10**6]
-    if not flat.any():
-        return 1
-    return max([step for step in steps if step * high <= 1], default=1)
-
-
-def decibels(target: Any, found: Any) -> str:
-    """PSNR of one image relative to radiance 1, in words."""
-    error = float(np.mean(np.square(np.asarray(found, np.float64) - np.asarray(target, np.float64))))
-    return "identical" if error == 0 else f"{-10 * np.log10(error):.1f} dB" if np.isfinite(error) else "not finite"
