@@ -167,6 +167,21 @@ def test_robust_losses_ignore_outliers():
     assert absolute < squared / 3
 
 
+def test_unknowns_are_told_apart_by_their_place():
+    """Not by their shape, and not by which array they hold: here two fields hold the same one."""
+    table = jnp.asarray(TRUTH.transfer.rgb)
+    scene = eqx.tree_at(lambda s: (s.transfer.rgb, s.transfer.sigma_t), TRUTH, (table, table))
+    assert scene.transfer.rgb is scene.transfer.sigma_t
+    pick = lambda s: {"sigma_t": s.transfer.sigma_t, "more": (s.transfer.domain, s.transfer.rgb)}
+    chosen = choose_unknowns(Exposed(scene, None), lambda m: pick(m.scene))
+    # Dictionaries are flattened in the order of their keys.
+    assert chosen.names == ("scene.transfer.domain", "scene.transfer.rgb", "scene.transfer.sigma_t")
+    assert len(set(chosen.places)) == 3
+    result = fit(scene, unknowns=pick, max_steps=1)
+    assert result.unknowns == ("transfer.domain", "transfer.rgb", "transfer.sigma_t")
+    np.testing.assert_array_equal(result.errors_by_name["transfer.sigma_t"], result.standard_errors["sigma_t"])
+
+
 def test_weights_take_pixels_out():
     spoiled = [image.copy() for image in IMAGES]
     weights = [np.ones(image.shape[:2]) for image in IMAGES]
@@ -300,6 +315,7 @@ def test_progress_is_called_with_every_iteration():
         ({"images": [IMAGES[0], IMAGES[1], np.full_like(IMAGES[2], np.nan)]}, "not finite"),
         ({"unknowns": lambda s: s.transfer.rgb * 1.0}, "arrays of the scene itself"),
         ({"unknowns": lambda s: ()}, "no array"),
+        ({"unknowns": lambda s: (s.transfer.rgb, s.transfer.rgb)}, "twice"),
         ({"transforms": (None,)}, "1 transforms for 2"),
         ({"weights": [np.ones((2, 2))] * 3}, "weights 0"),
     ],

@@ -19,7 +19,7 @@ from jvr.report.plots.pictures import difference_factor
 N = 8
 RNG = np.random.default_rng(3)
 RGB, SIGMA = RNG.uniform(0.1, 0.9, (N, 3)), RNG.uniform(0.1, 0.9, N)
-ERRORS = (np.full((N, 3), 0.02), np.full(N, 0.05))
+ERRORS = {"transfer.rgb": np.full((N, 3), 0.02), "transfer.sigma_t": np.full(N, 0.05)}
 
 
 @pytest.fixture
@@ -51,23 +51,15 @@ def spans(axes):
 # --- Which error belongs to which field ------------------------------------------------------------------------------
 
 
-def test_errors_are_told_apart_by_shape_or_by_name(table):
-    rgb, sigma_t = ERRORS
-    for given in ((rgb, sigma_t), (sigma_t, rgb), {"transfer.rgb": rgb, "sigma_t": sigma_t}):
-        found = field_errors(table, given)
-        assert set(found) == {"rgb", "sigma_t"}
-        assert found["rgb"].shape == (N, 3)
-    assert set(field_errors(table, sigma_t)) == {"sigma_t"}
+def test_errors_belong_to_the_field_of_their_name(table):
+    rgb, sigma_t = ERRORS.values()
+    assert set(field_errors(table, ERRORS | {"volume.values": np.zeros(5)})) == {"rgb", "sigma_t"}
+    assert set(field_errors(table, {"sigma_t": sigma_t})) == {"sigma_t"}
     assert field_errors(table, None) == {}
-    assert field_errors(table, (np.zeros(5),)) == {}
     whole = jvr.LutTransfer(rgb, sigma_t, (0.1, 0.2))
     assert set(field_errors(table, whole)) == {"rgb", "sigma_t", "domain"}
-
-
-def test_coloured_extinction_comes_after_colour():
-    table = jvr.LutTransfer(RGB, RGB, (0, 1))
-    first, second = np.full((N, 3), 1.0), np.full((N, 3), 2.0)
-    assert field_errors(table, (first, second))["sigma_t"][0, 0] == 2
+    with pytest.raises(ValueError, match=r"errors of rgb have shape \(8,\), its values \(8, 3\)"):
+        field_errors(table, {"transfer.rgb": sigma_t})
 
 
 # --- Transfer function -----------------------------------------------------------------------------------------------
@@ -99,9 +91,9 @@ def test_strip_shows_the_colours_in_srgb(table):
 
 
 def test_undetermined_entries_are_hollow_and_shaded(table):
-    rgb, sigma_t = (error.copy() for error in ERRORS)
+    rgb, sigma_t = (error.copy() for error in ERRORS.values())
     sigma_t[[2, 3, 7]], rgb[0, 1] = np.inf, np.inf
-    figure = plot_transfer(table, standard_errors=(rgb, sigma_t))
+    figure = plot_transfer(table, standard_errors={"rgb": rgb, "sigma_t": sigma_t})
     extinction, colour = panels(figure)["extinction"], panels(figure)["colour"]
     hollow = line(extinction, "_undetermined")
     np.testing.assert_allclose(hollow.get_ydata(), SIGMA[[2, 3, 7]], rtol=1e-6)
@@ -119,11 +111,13 @@ def test_undetermined_entries_are_hollow_and_shaded(table):
 def test_an_undetermined_entry_does_not_squeeze_the_rest():
     errors = np.where(np.arange(N) == 1, np.inf, 0.05)
     runaway = jvr.LutTransfer(RGB, np.where(np.arange(N) == 1, 1e6, SIGMA), (0, 1))
-    assert panels(plot_transfer(runaway, standard_errors=errors))["extinction"].get_ylim()[1] < 2
+    assert panels(plot_transfer(runaway, standard_errors={"sigma_t": errors}))["extinction"].get_ylim()[1] < 2
 
 
 def test_coloured_extinction_has_three_curves():
-    figure = plot_transfer(jvr.LinearTransfer(np.arange(N), RGB, RGB[:, ::-1]), standard_errors={"sigma_t": ERRORS[0]})
+    figure = plot_transfer(
+        jvr.LinearTransfer(np.arange(N), RGB, RGB[:, ::-1]), standard_errors={"sigma_t": ERRORS["transfer.rgb"]}
+    )
     np.testing.assert_allclose(line(panels(figure)["extinction"], "fitted, red").get_ydata(), RGB[:, 2], rtol=1e-6)
 
 
@@ -256,7 +250,7 @@ class Page(HTMLParser):
 def make_result(transfer, errors, history=(), outcome=jvr.Outcome.CONVERGED, held_out=(), rank=32, worst=()):
     stats = FitStats(12.3, 2_000_000, 1e-4, rank, 900.0, worst, held_out)
     scene = jvr.Scene(volume=jvr.Volume(jnp.zeros((2, 2, 2))), transfer=transfer)
-    return FitResult(scene, tuple(history), errors, outcome, 1.0, stats)
+    return FitResult(scene, tuple(history), tuple(errors.values()), tuple(errors), outcome, 1.0, stats)
 
 
 def make_page(tmp_path, result, **keywords):
@@ -307,9 +301,9 @@ def test_page_says_the_numbers(tmp_path, table, history):
 
 
 def test_page_names_what_is_undetermined(tmp_path, table):
-    rgb, sigma_t = (error.copy() for error in ERRORS)
+    rgb, sigma_t = (error.copy() for error in ERRORS.values())
     sigma_t[[2, 3, 7]], rgb[0] = np.inf, np.inf
-    result = make_result(table, (rgb, sigma_t), outcome=jvr.Outcome.STEP_LIMIT, rank=29)
+    result = make_result(table, {"transfer.rgb": rgb, "transfer.sigma_t": sigma_t}, outcome=jvr.Outcome.STEP_LIMIT, rank=29)
     text, page = make_page(tmp_path, result)
     assert "The images do not determine the colour of entry 0; the extinction of entries 2 to 3, 7." in page.text
     assert page.text.count("not determined") - page.text.count("are not determined") == 3 + 3
@@ -321,28 +315,38 @@ def test_page_names_what_is_undetermined(tmp_path, table):
 @pytest.mark.parametrize(
     ("transfer", "errors", "wanted"),
     [
-        (jvr.LinearTransfer(np.arange(N), RGB, SIGMA), (np.full(N, 0.5), *ERRORS), "7.00 ± 0.50"),
-        (jvr.LinearTransfer(np.arange(N), RGB, RGB), ERRORS[0], "extinction, blue"),
-        (jvr.GaussianTransfer([0.3], [0.1], [2.0], [[1, 0, 0]]), {"height": np.array([0.3])}, "2.00 ± 0.30"),
-        (jvr.GaussianTransfer([0.3], [0.1], [2.0], [[1, 0, 0]]), (np.full((1, 3), np.inf),), "the colour of Gaussian 0"),
+        (jvr.LinearTransfer(np.arange(N), RGB, SIGMA), {"transfer.positions": np.full(N, 0.5), **ERRORS}, "7.00 ± 0.50"),
+        (jvr.LinearTransfer(np.arange(N), RGB, RGB), {"transfer.rgb": ERRORS["transfer.rgb"]}, "extinction, blue"),
+        (jvr.GaussianTransfer([0.3], [0.1], [2.0], [[1, 0, 0]]), {"transfer.height": np.array([0.3])}, "2.00 ± 0.30"),
+        (
+            jvr.GaussianTransfer([0.3], [0.1], [2.0], [[1, 0, 0]]),
+            {"transfer.rgb": np.full((1, 3), np.inf)},
+            "the colour of Gaussian 0",
+        ),
     ],
 )
 def test_page_of_every_transfer_function(tmp_path, transfer, errors, wanted):
     assert wanted in make_page(tmp_path, make_result(transfer, errors))[1].text
 
 
-def test_names_of_unknowns_decide_and_others_are_listed(tmp_path, table):
-    errors = (np.full(N, 0.03), np.full((2, 2, 2), np.inf))
-    _, page = make_page(tmp_path, make_result(table, errors), unknowns=("transfer.sigma_t", "volume.values"))
+def test_what_is_not_of_the_transfer_function_is_listed(tmp_path, table):
+    errors = {"transfer.sigma_t": np.full(N, 0.03), "volume.values": np.full((2, 2, 2), np.inf)}
+    _, page = make_page(tmp_path, make_result(table, errors))
     assert f"{SIGMA[1]:.3f} ± 0.030" in page.text
     assert "volume.values not determined" in page.text
-    with pytest.raises(ValueError, match="2 fitted arrays and 1 names"):
-        make_page(tmp_path, make_result(table, errors), unknowns=("transfer.sigma_t",))
+
+
+def test_errors_of_fields_of_one_shape_are_not_confused(tmp_path):
+    table = jvr.LinearTransfer(np.arange(N), RGB, SIGMA)
+    errors = {"transfer.sigma_t": np.full(N, 0.03), "transfer.positions": np.full(N, 0.2)}
+    _, page = make_page(tmp_path, make_result(table, errors))
+    assert f"{SIGMA[1]:.3f} ± 0.030" in page.text
+    assert "1.00 ± 0.20" in page.text
 
 
 def test_long_tables_are_folded(tmp_path):
     long = jvr.LutTransfer(np.full((64, 3), 0.5), np.ones(64), (0, 1))
-    assert "<details><summary>All 64" in make_page(tmp_path, make_result(long, None))[0]
+    assert "<details><summary>All 64" in make_page(tmp_path, make_result(long, {}))[0]
 
 
 def test_a_failure_keeps_the_old_page(tmp_path, table):

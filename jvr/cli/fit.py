@@ -118,7 +118,6 @@ def _write_page(folder: Path, config: Config, job: FitJob, result: Any, fitted: 
         truth=job.truth,
         command=shlex.join(["jvr", "fit", config.name, "-o", str(folder), *sets]),
         config_text=config.text or None,
-        unknowns=config.tables.fit.unknowns if config.tables.fit else None,
         histogram=describe(job.scene.volume)["histogram"],
     )
 
@@ -127,7 +126,6 @@ def _report(config: Config, job: FitJob, result: Any, pictures: Any, seconds: fl
     """The machine-readable object of a fit. What the images do not determine has the standard error `null`."""
     tables = config.tables
     held_targets = job.held_out[1] if job.held_out else ()
-    errors = dict(zip(tables.fit.unknowns if tables.fit else (), map(np.asarray, result.standard_errors), strict=True))
     stats = result.stats
     return {
         "command": "fit",
@@ -141,7 +139,7 @@ def _report(config: Config, job: FitJob, result: Any, pictures: Any, seconds: fl
         "views": _scores(job.targets, pictures[0]),
         "held_out": _scores(held_targets, pictures[1]),
         "history": [{name: plain(value) for name, value in entry._asdict().items()} for entry in result.history],
-        "standard_errors": {name: nested(array) for name, array in errors.items()},
+        "standard_errors": {name: nested(array) for name, array in result.errors_by_name.items()},
         "rank": stats.rank,
         "condition": plain(stats.condition),
         "residual_variance": plain(stats.residual_variance),

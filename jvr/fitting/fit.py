@@ -70,6 +70,7 @@ class FitResult(NamedTuple):
     - `history`: one `Iteration` for each step.
     - `standard_errors`: of every fitted value, in the structure of `unknowns(scene)`; infinite where the images do not determine it,
       NaN for more unknowns than a Gauss-Newton matrix is made for (voxels).
+    - `unknowns`: the paths of the fitted arrays in the scene, such as `transfer.rgb`, in the order of `standard_errors`.
     - `outcome`: how the iteration ended.
     - `exposure`: the fitted factor between rendered and target radiance, 1 where it was not asked for.
     - `stats`: `FitStats`.
@@ -78,9 +79,15 @@ class FitResult(NamedTuple):
     scene: Scene
     history: tuple[Iteration, ...]
     standard_errors: Any
+    unknowns: tuple[str, ...]
     outcome: Outcome
     exposure: float
     stats: FitStats
+
+    @property
+    def errors_by_name(self) -> dict[str, np.ndarray]:
+        """The standard errors of each fitted array, by its path in the scene."""
+        return dict(zip(self.unknowns, map(np.asarray, jax.tree.leaves(self.standard_errors)), strict=True))
 
 
 def fit(
@@ -109,7 +116,7 @@ def fit(
 
     - `scene`: where the fit starts; what is not unknown stays as it is.
     - `cameras`, `images`: one target image `(height, width, 3)`, linear radiance, for each camera.
-    - `unknowns`: picks arrays out of the scene, for example `lambda s: (s.transfer.rgb, s.transfer.sigma_t)`.
+    - `unknowns`: picks arrays out of the scene by their place, for example `lambda s: (s.transfer.rgb, s.transfer.sigma_t)`.
     - `solver`: `None` is `jvr.LevenbergMarquardt()`; also `jvr.GaussNewton()`, `jvr.Dogleg()`, `jvr.LBFGSB()`, or any minimiser or
       least-squares solver of Optimistix.
     - `loss`: `jvr.SquaredError()`, `jvr.Huber()`, `jvr.AbsoluteError()` or, for solvers that use gradients alone, `jvr.DSSIM()`.
@@ -177,6 +184,7 @@ def fit(
         scene=found.scene,
         history=tuple(history),
         standard_errors=jax.tree.unflatten(structure, errors[: len(selected)]),
+        unknowns=tuple(name.removeprefix("scene.") for name in chosen.names[: len(selected)]),
         outcome=outcome or Outcome.STEP_LIMIT,
         exposure=1.0 if found.exposure is None else float(found.exposure),
         stats=stats,

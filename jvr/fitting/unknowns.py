@@ -159,36 +159,54 @@ class Unknowns(eqx.Module):
 def choose_unknowns(model: Exposed, select: Callable[[Exposed], Any], transforms: Any = None) -> Unknowns:
     """Finds the arrays that `select` returns among the model's own, and a transform for each.
 
+    `select` is called on abstract arrays: it may look at structure and shapes, not at values.
+
     Without `transforms` (a tuple, one for each array, `None` where the default is wanted), colours get `Sigmoid()`, extinction, heights
     and widths `Softplus`, positions `Ordered`, anything else `Identity`.
 
-    **Raises** `ValueError` where an array is not one of the scene's, is not floating point, or the number of transforms differs.
+    **Raises** `ValueError` where an array is not one of the scene's, not floating point or named twice, or the number of transforms
+    differs.
     """
-    selected = jax.tree.leaves(select(model))
-    paths = jax.tree_util.tree_leaves_with_path(model)
-    places = []
-    for array in selected:
-        place = next((i for i, (_, leaf) in enumerate(paths) if leaf is array), None)
-        if place is None:
-            raise ValueError(
-                "unknowns must return arrays of the scene itself, for example lambda s: (s.transfer.rgb, s.transfer.sigma_t)"
-            )
+    places = _places(model, select)
+    named = [(_name(path), leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(model)]
+    for name, array in (named[i] for i in places):
         if not eqx.is_inexact_array(array):
             raise ValueError(
-                f"{_name(paths[place][0]).removeprefix('scene.')} has integer voxels, which cannot be fitted: "
-                "convert them to floating point first"
+                f"{name.removeprefix('scene.')} has integer voxels, which cannot be fitted: convert them to floating point first"
             )
-        places.append(place)
-    if not places:
-        raise ValueError("unknowns returned no array: name at least one, for example lambda s: s.transfer.rgb")
-    names = tuple(_name(paths[i][0]) for i in places)
+    names = tuple(named[i][0] for i in places)
     given = (None,) * len(places) if transforms is None else tuple(transforms)
     if len(given) != len(places):
         raise ValueError(
             f"there are {len(given)} transforms for {len(places)} unknown arrays ({', '.join(names)}): give one for each"
         )
-    chosen = tuple(t or _default_transform(name, a, model) for t, name, a in zip(given, names, selected, strict=True))
-    return Unknowns(tuple(places), names, chosen)
+    chosen = tuple(t or _default_transform(*named[i], model) for t, i in zip(given, places, strict=True))
+    return Unknowns(places, names, chosen)
+
+
+def _places(model: Exposed, select: Callable[[Exposed], Any]) -> tuple[int, ...]:
+    """Where in the model's list of leaves the selected arrays are.
+
+    In an abstract model every leaf is an object of its own, also where two fields hold one and the same array.
+    """
+    leaves, structure = jax.tree.flatten(model)
+    places: list[int | None] = []
+
+    def note_places(*abstract: Any) -> None:
+        place = {id(leaf): i for i, leaf in enumerate(abstract)}
+        places.extend(place.get(id(array)) for array in jax.tree.leaves(select(jax.tree.unflatten(structure, abstract))))
+
+    jax.eval_shape(note_places, *leaves)
+    if not places:
+        raise ValueError("unknowns returned no array: name at least one, for example lambda s: s.transfer.rgb")
+    found = tuple(place for place in places if place is not None)
+    if len(found) < len(places):
+        raise ValueError(
+            "unknowns must return arrays of the scene itself, for example lambda s: (s.transfer.rgb, s.transfer.sigma_t)"
+        )
+    if len(set(found)) < len(found):
+        raise ValueError("unknowns returned an array twice: name each once")
+    return found
 
 
 def _name(path: Any) -> str:

@@ -3,35 +3,29 @@
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import numpy as np
 
 from jvr.model.transfer import AbstractTransfer
 
 
-def field_errors(transfer: AbstractTransfer, standard_errors: Any) -> dict[str, np.ndarray]:
+def field_errors(
+    transfer: AbstractTransfer, standard_errors: Mapping[str, Any] | AbstractTransfer | None
+) -> dict[str, np.ndarray]:
     """Standard errors by the name of the transfer function's field: `rgb`, `sigma_t`, `positions`, `height`, ...
 
-    **Arguments:** `standard_errors`: a mapping from fields (`"rgb"` or `"transfer.rgb"`), a transfer function that holds errors
-    in place of values, or arrays in the structure that a fit's `unknowns` returned. Such arrays are told apart by their shapes:
-    all fields in their order, else `rgb` first and then extinction, so pass a mapping where `positions`, `center` or `width` were
-    fitted without the others. Arrays that fit no field are left out.
+    **Arguments:** `standard_errors`: a mapping from fields, called `"rgb"` or, as `FitResult.errors_by_name` does,
+    `"transfer.rgb"`; or a transfer function that holds errors in place of values. What is not a field of the transfer function is
+    left out. **Raises** `ValueError` where an error has not the shape of its field.
     """
-    fields = {name: np.shape(value) for name, value in vars(transfer).items() if value is not None}
-    if standard_errors is None:
-        return {}
     if isinstance(standard_errors, AbstractTransfer):
         standard_errors = vars(standard_errors)
-    if isinstance(standard_errors, Mapping):
-        named = {name.rpartition(".")[2]: np.asarray(value) for name, value in standard_errors.items() if value is not None}
-        return {name: value for name, value in named.items() if fields.get(name) == value.shape}
-    arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(standard_errors)]
-    if [array.shape for array in arrays] == list(fields.values()):
-        return dict(zip(fields, arrays, strict=True))
-    likely = ("rgb", "sigma_t", "height", *fields)
-    found: dict[str, np.ndarray] = {}
-    for array in arrays:
-        name = next((name for name in likely if name not in found and fields.get(name) == array.shape), None)
-        if name:
-            found[name] = array
+    found = {}
+    for name, error in (standard_errors or {}).items():
+        field = name.removeprefix("transfer.")
+        value = vars(transfer).get(field)
+        if value is None or error is None:
+            continue
+        if np.shape(error) != np.shape(value):
+            raise ValueError(f"the errors of {field} have shape {np.shape(error)}, its values {np.shape(value)}")
+        found[field] = np.asarray(error)
     return found

@@ -9,7 +9,6 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from jvr.io.images import replacing
@@ -65,7 +64,6 @@ def write_fit_page(
     config_text: str | None = None,
     versions: Mapping[str, str] | None = None,
     before: Sequence[Any] | None = None,
-    unknowns: Sequence[str] | None = None,
     histogram: Any = None,
 ) -> Path:
     """Writes the page of a fit: one HTML file without scripts that refers to nothing outside of itself. Returns its path.
@@ -77,31 +75,22 @@ def write_fit_page(
     - `truth`: the transfer function that made the targets, where it is known.
     - `command`, `config_text`: what to type to make the page again, and the configuration it read.
     - `versions`: of packages; without them those installed are named.
-    - `unknowns`: names of the fitted arrays in the order of `result.standard_errors`, such as
-      `("transfer.rgb", "transfer.sigma_t")`. Without them they are recognised by their shapes, see
-      `jvr.report.errors.field_errors`.
     - `histogram`: of the volume's values, drawn behind the extinction, see `jvr.report.plots.plot_transfer`.
 
     The file appears under its name once it is whole. **Raises** `ValueError` where the numbers of images differ, `OSError` where
     the file cannot be written.
     """
     check_pairs(targets, fitted, before)
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(result.standard_errors)]
-    if unknowns is not None and len(unknowns) != len(leaves):
-        raise ValueError(f"there are {len(leaves)} fitted arrays and {len(unknowns)} names in unknowns: give one for each")
-    named = None if unknowns is None else dict(zip(unknowns, leaves, strict=True))
-    transfer = result.scene.transfer
-    of_transfer = result.standard_errors if named is None else _within(named, "transfer.")
-    errors = field_errors(transfer, of_transfer)
+    transfer, errors = result.scene.transfer, field_errors(result.scene.transfer, result.errors_by_name)
     sections = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="lead">{verdict(result, targets, fitted)}</p>',
-        summary(result, leaves, targets, fitted),
+        summary(result, targets, fitted),
         _pictures(targets, fitted, before),
         _transfer(transfer, errors, truth, histogram, _reached_by_light(transfer)),
         transfer_values(transfer, errors),
-        other_values(result.scene, named),
-        determination(result, leaves, transfer),
+        other_values(result.scene, result.errors_by_name),
+        determination(result, transfer),
         _convergence(result),
         _again(command, config_text, versions),
     ]
@@ -130,10 +119,6 @@ def _document(title: str, body: str) -> str:
 </body>
 </html>
 """
-
-
-def _within(named: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name: array for name, array in named.items() if name.startswith(prefix)}
 
 
 def _reached_by_light(transfer: AbstractTransfer) -> bool:

@@ -42,8 +42,8 @@ def _held_out(result: "FitResult") -> tuple[str, str, str] | None:
     return counted(len(scores), "view"), "identical" if psnr == np.inf else f"{psnr:.1f} dB", f"{ssim:.4f}"
 
 
-def summary(result: "FitResult", leaves: Sequence[np.ndarray], targets: Sequence[Any], fitted: Sequence[Any]) -> str:
-    stats, count = result.stats, _unknown_count(result, leaves)
+def summary(result: "FitResult", targets: Sequence[Any], fitted: Sequence[Any]) -> str:
+    stats, count = result.stats, _unknown_count(result)
     tiles = [
         ("outcome", result.outcome.value.partition(";")[0], ""),
         ("iterations", f"{len(result.history)}", ""),
@@ -70,9 +70,9 @@ def summary(result: "FitResult", leaves: Sequence[np.ndarray], targets: Sequence
     return "<dl>" + "".join(cell(*tile) for tile in tiles) + "</dl>"
 
 
-def _unknown_count(result: "FitResult", leaves: Sequence[np.ndarray]) -> int:
+def _unknown_count(result: "FitResult") -> int:
     """Exposure is an unknown too where it was fitted, but has no entry among the standard errors."""
-    return sum(leaf.size for leaf in leaves) + (result.exposure != 1.0)
+    return sum(errors.size for errors in result.errors_by_name.values()) + (result.exposure != 1.0)
 
 
 def _all_decibels(targets: Sequence[Any], fitted: Sequence[Any]) -> str:
@@ -80,8 +80,8 @@ def _all_decibels(targets: Sequence[Any], fitted: Sequence[Any]) -> str:
     return decibels(flat(targets), flat(fitted))
 
 
-def determination(result: "FitResult", leaves: Sequence[np.ndarray], transfer: AbstractTransfer) -> str:
-    stats, count = result.stats, _unknown_count(result, leaves)
+def determination(result: "FitResult", transfer: AbstractTransfer) -> str:
+    stats, count = result.stats, _unknown_count(result)
     missing = count - stats.rank
     if missing > 0:
         are = "are" if missing > 1 else "is"

@@ -83,10 +83,10 @@ def _undetermined(transfer: AbstractTransfer, errors: dict[str, np.ndarray]) -> 
     return f'<p class="unknown">The images do not determine the {escape("; the ".join(parts))}.</p>'
 
 
-def other_values(scene: Any, named: Mapping[str, np.ndarray] | None) -> str:
+def other_values(scene: Any, errors: Mapping[str, np.ndarray]) -> str:
     """What was fitted beside the transfer function: small arrays as numbers, others by size alone."""
     rows = []
-    for name, error in (named or {}).items():
+    for name, error in errors.items():
         if name.startswith("transfer."):
             continue
         value = np.asarray(_at(scene, name))

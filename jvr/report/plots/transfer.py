@@ -35,7 +35,7 @@ class _Curve(NamedTuple):
 def plot_transfer(
     fitted: AbstractTransfer,
     *,
-    standard_errors: Any = None,
+    standard_errors: Mapping[str, Any] | AbstractTransfer | None = None,
     truth: AbstractTransfer | None = None,
     histogram: Any = None,
     xlabel: str = "scalar value",
