@@ -1,8 +1,8 @@
-"""Functions with a delicate limit, and their derivatives."""
+"""Functions with a delicate limit, and their derivatives; reads and writes that the compiler does well."""
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Shaped
 
 from jvr.types import Corner, Triple
 
@@ -85,3 +85,18 @@ def ray_box(origin: Triple, direction: Triple, lower: Corner, upper: Corner) -> 
         leave = jnp.where(parallel, jnp.where(inside, jnp.inf, -jnp.inf), jnp.maximum(first, second))
         t_near, t_far = jnp.maximum(t_near, enter), jnp.minimum(t_far, leave)
     return t_near, t_far
+
+
+def read_run(array: Shaped[Array, "n *row"], start: Int[Array, ""], length: int) -> Shaped[Array, "length *row"]:
+    """`array[start : start + length]` for a traced `start` that the caller keeps inside: nothing is clamped."""
+    numbers = jax.lax.GatherDimensionNumbers(tuple(range(array.ndim)), (), (0,))
+    sizes = (length, *array.shape[1:])
+    return jax.lax.gather(array, start[None], numbers, sizes, mode="promise_in_bounds")
+
+
+def add_runs(
+    array: Float[Array, "n *row"], starts: Int[Array, "runs"], terms: Float[Array, "runs length *row"]
+) -> Float[Array, "n *row"]:
+    """Adds `terms[i]` to `array[starts[i] : starts[i] + length]` for every `i`; runs may overlap and must lie inside."""
+    numbers = jax.lax.ScatterDimensionNumbers(tuple(range(1, terms.ndim)), (), (0,))
+    return jax.lax.scatter_add(array, starts[:, None], terms, numbers, mode="promise_in_bounds")

@@ -52,7 +52,7 @@ def _replay_forward(options: MarchOptions, *arguments: Any):
     is_primal = lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
     inputs = jax.tree.map(lambda x: x.value, arguments, is_leaf=is_primal)
     perturbed = jax.tree.map(lambda x: x.perturbed and eqx.is_inexact_array(x.value), arguments, is_leaf=is_primal)
-    end = integrate(options, *inputs)
+    end = integrate(options, *inputs, for_replay=True)
     # What is perturbed is known by which half of the inputs a leaf is in: a None in `wanted` asks for no derivative.
     wanted, fixed = eqx.partition(inputs, perturbed)
     return marched(end), (wanted, fixed, end._replace(sums=None))
@@ -205,6 +205,9 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marc
         jnp.add, (rest_of_transfer, total.medium.shader, state.gradient, total.dt), small_gradient
     )
     entries = deposit_entries(entries, medium.transfer, s, entry_cotangent)
+    # Always true; a conditional is the one thing that the compiler does not fuse through. Without it the whole computation of the
+    # cotangent is repeated in each of the scattered additions, which then take three times as long.
+    s_cotangent = jax.lax.cond(jnp.any(state.j < back.steps), lambda x: x, jnp.zeros_like, s_cotangent)
     field = medium.field.deposit(total.medium.field, points, s_cotangent)
     medium_gradient = Medium(field, eqx.combine(rest_of_transfer, entries), shader)
     behind = step_back(state.behind, front, emitted, dtau, u)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int, UInt
 from jvr.march.march import AbstractField
 from jvr.march.steps import Point
 from jvr.model.volume import Volume
+from jvr.numerics import add_runs
 from jvr.types import Scalar
 
 
@@ -24,10 +25,10 @@ class VoxelField(AbstractField):
     def deposit(self, gradient: Any, points: Point, cotangent: Float[Array, "rays"]) -> Any:
         volume, total = self.volume, gradient.volume
         if total.values is not None:
-            indices, weights = jax.vmap(lambda p: volume.interpolation.stencil(volume.shape, p))(points.p)
             flat = total.values.reshape(-1)
-            for i, w in zip(indices, weights, strict=True):
-                flat = flat.at[i].add((w * cotangent * volume.slope).astype(flat.dtype), mode="promise_in_bounds")
+            for starts, weights in jax.vmap(lambda p: volume.interpolation.stencil(volume.shape, p))(points.p):
+                terms = jnp.stack([w * cotangent * volume.slope for w in weights], axis=1)
+                flat = add_runs(flat, starts, terms.astype(flat.dtype))
             total = eqx.tree_at(lambda v: v.values, total, flat.reshape(volume.shape))
         if total.slope is not None:
             stored = jax.vmap(volume.interpolate)(points.p)

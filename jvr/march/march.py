@@ -111,29 +111,36 @@ def march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marc
     return marched(integrate(options, medium, rays, dt))
 
 
-def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Progress:
-    """Every ray at its end."""
+def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar, *, for_replay: bool = False) -> Progress:
+    """Every ray at its end; `front` and `last` are noted only where a replay will need them."""
     emits, absorbs = channel_counts(medium, rays, dt)
 
     def start(lanes: Lanes) -> Progress:
         zero = jnp.zeros_like(lanes.rays.length)
         blank = (zero,) * absorbs
         sums = Sums((zero,) * emits, (zero,) * emits, blank, blank, blank * options.distance)
-        return Progress(sums, jnp.zeros_like(lanes.segments), blank, (jnp.zeros_like(lanes.segments),) * absorbs)
+        no_steps = jnp.zeros_like(lanes.segments)
+        return Progress(sums, no_steps, blank * for_replay, (no_steps,) * absorbs * for_replay)
 
     def advance(lanes: Lanes, progress: Progress, _: None) -> tuple[Progress, None]:
         alive = is_alive(options, lanes, progress)
         sums = progress.sums
         emitted, dtau, u = take_segment(medium, lanes, dt, progress.steps, jnp.where(alive, lanes.segments, 0))
-        depth = join(sums.tau, sums.tau_low)
-        clear = [alive & (now < opaque_depth(now.dtype)) for now in depth]
-        front = tuple(jnp.where(c, now, old) for c, now, old in zip(clear, depth, progress.front, strict=True))
-        last = tuple(jnp.where(c, progress.steps, old) for c, old in zip(clear, progress.last, strict=True))
+        front, last = note_front(progress, alive) if for_replay else ((), ())
         return Progress(add_segment(sums, emitted, dtau, u), progress.steps + alive, front, last), None
 
     lanes = lanes_of(rays, dt)
     alive = functools.partial(is_alive, options)
     return pooled_while(alive, advance, start, lambda progress: progress, lanes, None, lanes.segments)[0]
+
+
+def note_front(progress: Progress, alive: Bool[Array, "rays"]) -> tuple[Channels, tuple[Int[Array, "rays"], ...]]:
+    """`front` and `last` of `progress` as the next segment is about to be taken."""
+    depth = join(progress.sums.tau, progress.sums.tau_low)
+    clear = [alive & (now < opaque_depth(now.dtype)) for now in depth]
+    front = tuple(jnp.where(c, now, old) for c, now, old in zip(clear, depth, progress.front, strict=True))
+    last = tuple(jnp.where(c, progress.steps, old) for c, old in zip(clear, progress.last, strict=True))
+    return front, last
 
 
 def lanes_of(rays: Rays, dt: Scalar) -> Lanes:

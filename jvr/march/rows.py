@@ -49,7 +49,7 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
 
     Distances have no rows. Memory: `rays x entries` numbers for each row that `TableRows` lists. Detached as in `march`.
     """
-    end = integrate(options, medium, rays, dt)
+    end = integrate(options, medium, rays, dt, for_replay=True)
     assert isinstance(medium.transfer, AbstractTable)
     n = medium.transfer.rgb.shape[0]
     emits, absorbs = len(end.sums.radiance), len(end.front)

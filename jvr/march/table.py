@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jvr.model.transfer import AbstractTable, AbstractTransfer, Classified
+from jvr.numerics import add_runs
 
 
 def split_entries(tree: AbstractTransfer) -> tuple[Any, Any]:
@@ -23,7 +24,7 @@ def split_entries(tree: AbstractTransfer) -> tuple[Any, Any]:
 def deposit_entries(gradient: Any, table: AbstractTransfer, s: Float[Array, "rays"], cotangent: Classified) -> Any:
     """Adds the derivative of `sum(cotangent * table.evaluate(s))` to the entries of `gradient` that are not `None`.
 
-    Each sample touches the two entries around it. All channels go into one row: two scattered rows for each sample, and not two
+    Each sample touches the two entries around it. All channels go into one row: one scattered pair of rows for each sample, and not two
     scattered numbers for each channel.
     """
     if not isinstance(table, AbstractTable):
@@ -37,8 +38,8 @@ def deposit_entries(gradient: Any, table: AbstractTransfer, s: Float[Array, "ray
     rows = jnp.stack(sum(columns, ()), axis=1)
     u = jax.vmap(table.coordinate)(s)
     low = jnp.clip(jnp.floor(u), 0, packed.shape[0] - 2)
-    i, fraction = low.astype(jnp.int32), (u - low)[:, None]
-    packed = packed.at[i].add((1 - fraction) * rows).at[i + 1].add(fraction * rows)
+    fraction = (u - low)[:, None]
+    packed = add_runs(packed, low.astype(jnp.int32), jnp.stack([(1 - fraction) * rows, fraction * rows], axis=1))
     split = jnp.split(packed, [len(columns[0])], axis=1)[: len(wanted)]
     deposited = [part.reshape(entries.shape) for part, entries in zip(split, wanted, strict=True)]
     return eqx.tree_at(lambda t: [e for e in (t.rgb, t.sigma_t) if e is not None], gradient, deposited)

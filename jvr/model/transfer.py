@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model.checks import float_array, require
-from jvr.numerics import divide_or_zero
+from jvr.numerics import divide_or_zero, read_run
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 
@@ -173,9 +173,11 @@ def _three(v: Float[Array, "3"]) -> Triple:
 
 
 def _interpolate(table: AbstractTable, u: Scalar) -> Classified:
-    low = jnp.clip(jnp.floor(u), 0, table.rgb.shape[0] - 2)
-    i, fraction = low.astype(jnp.int32), u - low
+    # One array, so that one read brings both rows around `u` with all their columns.
+    rows = jnp.stack([*_columns(table.rgb), *_columns(table.sigma_t)], axis=1)
+    low = jnp.clip(jnp.floor(u), 0, rows.shape[0] - 2)
+    fraction = u - low
+    below, above = read_run(rows, low.astype(jnp.int32), 2)
     # The weighted sum, not a + f (b - a): at an end of an interval it returns the entry exactly.
-    read = lambda column: (1 - fraction) * column[i] + fraction * column[i + 1]
-    r, g, b = (read(column) for column in _columns(table.rgb))
-    return Classified((r, g, b), tuple(read(column) for column in _columns(table.sigma_t)))
+    r, g, b, *sigma_t = ((1 - fraction) * below[c] + fraction * above[c] for c in range(rows.shape[1]))
+    return Classified((r, g, b), tuple(sigma_t))

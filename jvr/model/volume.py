@@ -1,54 +1,59 @@
 """The scalar volume: voxels, where they lie in the world, and how values between them are defined."""
 
 import abc
-import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jvr.model.checks import affine, float_array, require
+from jvr.numerics import read_run
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
 
-Stencil = tuple[tuple[Int[Array, ""], ...], tuple[Float[Array, ""], ...]]
+
+class Run(NamedTuple):
+    """Neighbouring voxels along the last axis: the flat index of the first, and the weight of each."""
+
+    start: Int[Array, ""]
+    weights: tuple[Float[Array, ""], ...]
 
 
 class AbstractInterpolation(eqx.Module):
     """How a value between voxels is made of the voxels around it."""
 
     @abc.abstractmethod
-    def stencil(self, shape: tuple[int, int, int], p: Triple) -> Stencil:
-        """Flat indices of the voxels that make the value at grid position `p`, and their weights, which sum to one."""
+    def stencil(self, shape: tuple[int, int, int], p: Triple) -> tuple[Run, ...]:
+        """The voxels that make the value at grid position `p`; their weights sum to one."""
 
 
 class Trilinear(AbstractInterpolation):
     """Trilinear interpolation of the eight voxels around a point; continuous, differentiable in position inside each cell."""
 
-    def stencil(self, shape: tuple[int, int, int], p: Triple) -> Stencil:
-        axes = [_linear(x, n) for x, n in zip(p, shape, strict=True)]
-        strides = (shape[1] * shape[2], shape[2], 1)
-        indices, weights = [], []
-        for corner in range(8):
-            bits = (corner >> 2 & 1, corner >> 1 & 1, corner & 1)
-            indices.append(sum(axis[0][b] * stride for axis, b, stride in zip(axes, bits, strides, strict=True)))
-            weights.append(math.prod([axis[1][b] for axis, b in zip(axes, bits, strict=True)]))
-        return tuple(indices), tuple(weights)
+    def stencil(self, shape: tuple[int, int, int], p: Triple) -> tuple[Run, ...]:
+        (i, wx), (j, wy), (k, wz) = (_linear(x, n) for x, n in zip(p, shape, strict=True))
+        # Runs of voxels that lie side by side in memory: half as many reads and writes as single voxels.
+        return tuple(
+            Run(((i + a) * shape[1] + j + b) * shape[2] + k, tuple(wx[a] * wy[b] * w for w in wz))
+            for a in range(len(wx))
+            for b in range(len(wy))
+        )
 
 
 class Nearest(AbstractInterpolation):
     """The value of the nearest voxel: for labels. Its derivative with respect to position is zero."""
 
-    def stencil(self, shape: tuple[int, int, int], p: Triple) -> Stencil:
+    def stencil(self, shape: tuple[int, int, int], p: Triple) -> tuple[Run, ...]:
         i, j, k = (jnp.clip(jnp.round(x), 0, n - 1).astype(jnp.int32) for x, n in zip(p, shape, strict=True))
-        return ((i * shape[1] + j) * shape[2] + k,), (jnp.ones_like(p[0]),)
+        return (Run((i * shape[1] + j) * shape[2] + k, (jnp.ones_like(p[0]),)),)
 
 
-def _linear(x: Scalar, n: int):
-    """The two voxels around `x` on an axis of `n`, and their weights; an axis of one voxel is constant."""
-    low = jnp.clip(jnp.floor(x), 0, max(n - 2, 0))
-    fraction = x - low if n > 1 else jnp.zeros_like(x)
-    index = low.astype(jnp.int32)
-    return (index, index + min(n - 1, 1)), (1 - fraction, fraction)
+def _linear(x: Scalar, n: int) -> tuple[Int[Array, ""], tuple[Scalar, ...]]:
+    """The first of the two voxels around `x` on an axis of `n`, and the weights of both; an axis of one voxel is constant."""
+    if n == 1:
+        return jnp.zeros_like(x, jnp.int32), (jnp.ones_like(x),)
+    low = jnp.clip(jnp.floor(x), 0, n - 2)
+    return low.astype(jnp.int32), (1 - (x - low), x - low)
 
 
 class Volume(eqx.Module):
@@ -134,10 +139,11 @@ class Volume(eqx.Module):
 
     def interpolate(self, p: Triple) -> Scalar:
         """The stored voxels interpolated at one grid position, before slope and intercept."""
-        indices, weights = self.interpolation.stencil(self.shape, p)
-        voxels = self.values.reshape(-1)
-        read = lambda i, w: w * voxels.at[i].get(mode="promise_in_bounds").astype(w.dtype)
-        return sum((read(i, w) for i, w in zip(indices, weights, strict=True)), jnp.zeros_like(p[0]))
+        voxels, value = self.values.reshape(-1), jnp.zeros_like(p[0])
+        for start, weights in self.interpolation.stencil(self.shape, p):
+            run = read_run(voxels, start, len(weights))
+            value += sum(w * run[i].astype(w.dtype) for i, w in enumerate(weights))
+        return value
 
     def grid_from_world(self, x: Triple, *, direction: bool = False) -> Triple:
         """Grid position of a world position, or with `direction=True` grid displacement of a world displacement.
