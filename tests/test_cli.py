@@ -2,9 +2,11 @@
 
 import json
 import os
+import shutil
 import stat
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -247,6 +249,33 @@ def test_the_installed_command_starts_and_refuses(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60)
     assert done.returncode == 2
     assert done.stderr == "jvr: other/no.toml: no such file\n"
+
+
+def test_an_installed_wheel_has_the_demo(tmp_path):
+    """`jvr demo` needs no repository: the wheel, unpacked elsewhere, finds its configuration in itself."""
+    pytest.importorskip("setuptools", reason="builds a wheel without the network")
+    repository, source, installed = Path(__file__).parents[1], tmp_path / "source", tmp_path / "installed"
+    source.mkdir()
+    for folder in ("jvr", "configs"):
+        shutil.copytree(repository / folder, source / folder)
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        shutil.copy(repository / name, source)
+    build = ["wheel", "--quiet", "--no-build-isolation", "--no-deps", "--wheel-dir", tmp_path, source]
+    subprocess.run([sys.executable, "-m", "pip", *map(str, build)], check=True, capture_output=True, timeout=120)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(installed)
+    code = (
+        "import jvr; from jvr.cli.fit import demo_config; print(demo_config()); from jvr.cli import run; run(['demo', '--help'])"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(installed), "JVR_CACHE": "0"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True, timeout=60)
+    assert Path(done.stdout.splitlines()[0]) == installed / "jvr" / "configs" / "demo.toml"
+    assert (installed / "jvr" / "configs" / "demo.toml").read_text() == (repository / "configs" / "demo.toml").read_text()
+    assert "jvr demo" in done.stdout
+    # A package that the wheel forgets is still there for everyone who works in the repository.
+    modules = lambda root: {path.relative_to(root).as_posix() for path in (root / "jvr").rglob("*.py")}
+    assert modules(installed) == modules(repository)
 
 
 def test_the_compilation_cache_lies_in_the_users_cache_folder(tmp_path, monkeypatch):

@@ -18,13 +18,10 @@ PAGE = "report.html"
 
 
 def demo_config() -> Path:
-    """The configuration of `jvr demo`, in the package or in the repository that it is used from."""
+    """The configuration of `jvr demo`: installed with the package, or beside it where the package is used from its repository."""
     package = Path(__file__).parents[1]
-    places = (package / "configs" / "demo.toml", package.parent / "configs" / "demo.toml")
-    found = next((place for place in places if place.exists()), None)
-    if found is None:
-        raise FileNotFoundError("configs/demo.toml is not installed; run `jvr demo` from the repository")
-    return found
+    installed = package / "configs" / "demo.toml"
+    return installed if installed.exists() else package.parent / "configs" / "demo.toml"
 
 
 def fit_scene(config: Config, folder: Path, *, resume: bool) -> dict[str, Any]:
