@@ -143,7 +143,7 @@ def startup() -> dict[str, Any]:
         picture = str(Path(folder) / "picture.png")
         config = str(Path(__file__).parents[1] / "configs" / "demo.toml")
         command = (str(Path(sys.executable).with_name("jvr")), "render", config, "-o", picture, "--set", "camera.width=256")
-        command += ("--set", "camera.height=256")
+        command += ("--set", "camera.height=256", "--set", "camera.count=1")
         cold = run(*command, XDG_CACHE_HOME=folder)
         warm = run(*command, XDG_CACHE_HOME=folder)
     return {"import_beyond_jax": statistics.median(imports), "render_cold": cold, "render_warm": warm}
