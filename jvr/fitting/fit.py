@@ -15,14 +15,14 @@ import optimistix as optx
 from jvr.fitting import checkpoint as checkpoints
 from jvr.fitting.identifiability import Determination, undetermined
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
-from jvr.fitting.objective import Problem, march_unknowns, predict
+from jvr.fitting.objective import Problem, march_unknowns
 from jvr.fitting.observations import Observations, check_images, keep_samples, observe
 from jvr.fitting.solvers import LBFGSB, AbstractSolver, ChunkedLeastSquares, LevenbergMarquardt, OptimistixSolver
 from jvr.fitting.unknowns import Exposed, Identity, Softplus, Unknowns, choose_unknowns
 from jvr.fitting.work import Work, fingerprint
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.rendering.image import trace
+from jvr.rendering.image import render
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
 
@@ -178,7 +178,7 @@ def fit(
         rank=known.rank,
         condition=known.condition,
         worst=_worst(chosen, model, known),
-        held_out=() if held_out is None else _compare(problem, found, *held_out),
+        held_out=() if held_out is None else _compare(found, settings, *held_out),
     )
     return FitResult(
         scene=found.scene,
@@ -261,16 +261,16 @@ def _worst(chosen: Unknowns, model: Exposed, known: Determination, most: int = 6
     return tuple((labels[i], float(known.worst[i])) for i in order)
 
 
-def _compare(problem: Problem, found: Exposed, cameras: Sequence[AbstractCamera], images: Any) -> tuple[tuple[float, float], ...]:
+def _compare(
+    found: Exposed, settings: Settings, cameras: Sequence[AbstractCamera], images: Any
+) -> tuple[tuple[float, float], ...]:
     """PSNR and SSIM of views that took no part in the fit."""
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+    program, exposure = jax.jit(render), 1.0 if found.exposure is None else float(found.exposure)
     scores = []
     for camera, target in zip(cameras, check_images(cameras, images, "held-out image"), strict=True):
-        gathered, rays, _ = trace(
-            found.scene, camera, problem.settings, jnp.arange(camera.width * camera.height, dtype=jnp.int32)
-        )
-        rendered = np.stack(predict(problem, found, gathered, rays.length), axis=-1).reshape(target.shape)
+        rendered = exposure * np.asarray(program(found.scene, camera, settings).rgb)
         psnr = peak_signal_noise_ratio(target, rendered, data_range=1.0)
         # An odd window that fits into the smallest picture.
         window = min(7, (min(target.shape[:2]) - 1) // 2 * 2 + 1)
