@@ -1,5 +1,6 @@
 """Every way to differentiate a rendering against every other, and against central differences, for every kind of parameter."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -205,3 +206,17 @@ def test_memory_of_a_gradient_does_not_grow_with_the_steps():
     of_voxels, of_transfer = temporary(0.5, 0), temporary(0.5, 1)
     assert abs(temporary(0.03, 0) - of_voxels) <= 0.05 * of_voxels
     assert max(of_voxels, of_transfer) <= 300 * size * size + 2 * volume.values.nbytes
+
+
+@pytest.mark.parametrize("of", ["volume", "transfer"])
+def test_parts_of_different_precision(of, x64):
+    """With x64 on, a single-precision part of a scene keeps the others' digits and gets a gradient in its own."""
+    volume = jvr.Volume(voxels(), OBLIQUE)
+    scene, camera = jvr.Scene(volume, linear_transfer()), perspective(volume)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, getattr(scene, of))
+    mixed = eqx.tree_at(lambda s: getattr(s, of), scene, single)
+    total = jax.jit(jax.grad(lambda s: jnp.sum(jvr.render(s, camera).rgb), allow_int=True))
+    ours, true = total(mixed), total(scene)
+    for a, b, x in zip(*map(jax.tree.leaves, (ours, true, mixed)), strict=True):
+        assert a.dtype == x.dtype
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * np.abs(b).max())

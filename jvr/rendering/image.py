@@ -57,9 +57,21 @@ def trace(
     scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], *, distance: bool = False
 ) -> tuple[Marched, Rays, Float[Array, "rays"]]:
     """Marches the rays of some pixels; returns what they gathered, the rays, and the distance from the eye to their entry."""
+    scene, camera = one_precision(scene, camera)
     rays, t_in = enter(scene, *camera.rays(pixels))
     options = MarchOptions(settings.termination, distance)
     return settings.adjoint.march(options, medium(scene), rays, step_length(scene, settings)), rays, t_in
+
+
+def one_precision(scene: Scene, camera: AbstractCamera) -> tuple[Scene, AbstractCamera]:
+    """Every floating-point array in the widest precision among them, as the state of the loop needs; with x64 on, parts of a scene
+    may differ. Voxels stay as they are in memory."""
+    voxels = lambda tree: tree[0].volume.values
+    rest = eqx.tree_at(voxels, (scene, camera), None)
+    floats, others = eqx.partition(rest, eqx.is_inexact_array)
+    widest = jnp.result_type(*jax.tree.leaves(floats))
+    promoted = eqx.combine(jax.tree.map(lambda x: x.astype(widest), floats), others)
+    return eqx.tree_at(voxels, promoted, scene.volume.values, is_leaf=lambda x: x is None)
 
 
 def step_length(scene: Scene, settings: Settings) -> Scalar:
