@@ -38,7 +38,6 @@ from jvr.march.march import (
     transmittance,
 )
 from jvr.march.steps import Rays, points_at, segment
-from jvr.march.table import deposit_entries, split_entries
 from jvr.numerics import one_minus_exp
 from jvr.types import Channels, Scalar
 
@@ -178,40 +177,34 @@ def replay(wanted: Any, fixed: Any, end: Any, cotangent: Marched) -> Any:
 
 def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marched, state: _ReplayState, total: _Gradients):
     lanes, (k, count) = back.lanes, back.at(state.j)
-    # Entries of a table are not among `small`: automatic differentiation would scatter each column by itself.
-    rest_of_transfer, entries = split_entries(total.medium.transfer)
-    small_mask = is_there((rest_of_transfer, total.medium.shader, state.gradient, total.dt))
+    # The field is not among `small`: it deposits its derivative itself, in place, through the tap.
+    small_mask = is_there((total.medium.transfer, total.medium.shader, state.gradient, total.dt))
     small, rest = eqx.partition((medium.transfer, medium.shader, lanes.rays, dt), small_mask)
 
-    def local(small: Any, tap: Array, classified_tap: Any):
-        """The segment as a function of what its derivative is wanted for; taps stand for the field and the table's entries."""
+    def local(small: Any, tap: Array):
+        """The segment as a function of what its derivative is wanted for; the tap stands for the field."""
         transfer, shader, rays, dt = eqx.combine(small, rest)
         extent, u = segment(k, count, rays.length, dt)
         points = points_at(rays, lanes.ray, k, u)
-        s = jax.vmap(medium.field.resample)(points) + tap
-        classified = jax.tree.map(jnp.add, jax.vmap(transfer.evaluate)(s), classified_tap)
-        return (*jax.vmap(shader.segment)(classified, points, extent), u), (points, s)
+        classified = jax.vmap(transfer.evaluate)(jax.vmap(medium.field.resample)(points) + tap)
+        return (*jax.vmap(shader.segment)(classified, points, extent), u), points
 
-    no_tap = jnp.zeros_like(lanes.rays.length)
-    classified = jax.eval_shape(jax.vmap(medium.transfer.evaluate), no_tap)
-    no_taps = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), classified)
-    (emitted, dtau, u), pull, (points, s) = jax.vjp(local, small, no_tap, no_taps, has_aux=True)
+    (emitted, dtau, u), pull, points = jax.vjp(local, small, jnp.zeros_like(lanes.rays.length), has_aux=True)
 
     front = back.depth(state.j, state.behind, dtau)
     before = transmittance(*front)
-    small_gradient, s_cotangent, entry_cotangent = pull(segment_cotangents(cotangent, state.behind, before, dtau, u))
+    small_gradient, s_cotangent = pull(segment_cotangents(cotangent, state.behind, before, dtau, u))
 
-    rest_of_transfer, shader, ray_gradient, dt_gradient = jax.tree.map(
-        jnp.add, (rest_of_transfer, total.medium.shader, state.gradient, total.dt), small_gradient
+    transfer, shader, ray_gradient, dt_gradient = jax.tree.map(
+        jnp.add, (total.medium.transfer, total.medium.shader, state.gradient, total.dt), small_gradient
     )
-    entries = deposit_entries(entries, medium.transfer, s, entry_cotangent)
     # Always true; a conditional is the one thing that the compiler does not fuse through. Without it the whole computation of the
     # cotangent is repeated in each of the scattered additions, which then take three times as long.
     s_cotangent = jax.lax.cond(jnp.any(state.j < back.steps), lambda x: x, jnp.zeros_like, s_cotangent)
     field = medium.field.deposit(total.medium.field, points, s_cotangent)
-    medium_gradient = Medium(field, eqx.combine(rest_of_transfer, entries), shader)
     behind = step_back(state.behind, front, emitted, dtau, u)
-    return _ReplayState(behind, state.j + (state.j < back.steps), ray_gradient), _Gradients(medium_gradient, dt_gradient)
+    state = _ReplayState(behind, state.j + (state.j < back.steps), ray_gradient)
+    return state, _Gradients(Medium(field, transfer, shader), dt_gradient)
 
 
 def is_there(tree: Any) -> Any:

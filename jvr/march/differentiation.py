@@ -12,7 +12,7 @@ from jvr.march.adjoint import Inputs, is_there, replay_march
 from jvr.march.march import Marched, MarchOptions, Medium, march
 from jvr.march.rows import TableRows, table_rows
 from jvr.march.steps import Rays
-from jvr.march.table import split_entries
+from jvr.model.transfer import AbstractTable, AbstractTransfer
 from jvr.types import Scalar
 
 
@@ -63,7 +63,7 @@ def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[M
     perturbed = jax.tree.map(lambda t, x: not is_zero(t) and eqx.is_inexact_array(x), tangents, primals, is_leaf=is_zero)
     tangents = eqx.filter(tangents, perturbed)
     medium, rays, dt = primals
-    rest_of_transfer, entries = split_entries(tangents[0].transfer)
+    rest_of_transfer, entries = _split_entries(tangents[0].transfer)
     if options.distance or not jax.tree.leaves(entries):
         primal, tangent = march(options, *primals), None
     else:
@@ -80,6 +80,16 @@ def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[M
 
 
 _rows_march.defjvp(_rows_rule, symbolic_zeros=True)
+
+
+def _split_entries(tree: AbstractTransfer) -> tuple[Any, Any]:
+    """The same tree twice: without the entries of a table (its colours and extinctions), and with nothing but them."""
+    if not isinstance(tree, AbstractTable):
+        return tree, jax.tree.map(lambda _: None, tree)
+    rest = eqx.tree_at(lambda t: (t.rgb, t.sigma_t), tree, (None, None), is_leaf=lambda x: x is None)
+    nothing = jax.tree.map(lambda _: None, tree)
+    entries = eqx.tree_at(lambda t: (t.rgb, t.sigma_t), nothing, (tree.rgb, tree.sigma_t), is_leaf=lambda x: x is None)
+    return rest, entries
 
 
 def _times_entries(rows: TableRows, tangent: Any) -> Marched:
