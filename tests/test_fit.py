@@ -234,6 +234,51 @@ def test_determination_of_a_known_matrix():
     assert known.worst[2] == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.parametrize(("angle", "determined"), [(1.0, True), (3e-2, True), (1e-3, True), (1e-6, False)])
+def test_nearly_parallel_columns_are_told_apart_down_to_the_rounding_of_float32(angle, determined):
+    """Columns of one unit each, but for one of a thousandth; 3 and 4 enclose `angle`."""
+    columns, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3000, 5)))
+    columns[:, 4] = np.cos(angle) * columns[:, 3] + np.sin(angle) * columns[:, 4]
+    columns[:, 0] *= 1e-3
+    rounded = columns.astype(np.float32).astype(np.float64)
+    known = determination(rounded.T @ rounded, squares=3.0, measurements=3000)
+    exact = np.sqrt(3.0 / (3000 - known.rank) * np.diag(np.linalg.inv(columns.T @ columns)))
+    assert known.rank == (5 if determined else 4)
+    # Rounding turns a column by 3e-8, which is 3e-5 of the smallest angle that is determined.
+    np.testing.assert_allclose(known.standard_errors[:3], exact[:3], rtol=1e-5)
+    if determined:
+        np.testing.assert_allclose(known.standard_errors[3:], exact[3:], rtol=1e-4)
+    else:
+        assert np.all(np.isinf(known.standard_errors[3:]))
+
+
+def test_standard_errors_are_those_of_a_dense_float64_computation():
+    """Also of an entry whose colour changes the image a thousandth as much as others do; those beyond the volume are infinite."""
+    weak, beyond = 2, 6
+    faint = TRUTH.transfer.sigma_t.at[weak - 1 : weak + 2].set(1e-4)
+    scene = eqx.tree_at(lambda s: (s.transfer.sigma_t, s.transfer.domain), TRUTH, (faint, jnp.array([0.0, 1.5])))
+    target = IMAGES[0] + np.random.default_rng(5).normal(0, 0.01, IMAGES[0].shape).astype(np.float32)
+    result = jvr.fit(
+        scene, CAMERAS[:1], [target], unknowns=both, settings=SETTINGS, max_steps=0, transforms=(jvr.Identity(),) * 2
+    )
+    with jax.enable_x64(True):
+        found, camera = jax.tree.map(lambda x: jnp.asarray(x, float), (result.scene, CAMERAS[0]))
+        settings = jvr.Settings(SETTINGS.step, termination=SETTINGS.termination, adjoint=jvr.Forward())
+        of_table = lambda table: jvr.residuals(eqx.tree_at(both, found, table), (camera,), [target], settings).ravel()
+        r, parts = jax.jit(lambda table: (of_table(table), jax.jacfwd(of_table)(table)))(both(found))
+    rows = np.concatenate([np.reshape(part, (r.size, -1)) for part in parts], axis=1)
+    norms = np.linalg.norm(rows, axis=0)
+    seen = norms > 0
+    assert 3e-4 < norms[3 * weak] / norms[: 3 * ENTRIES].max() < 3e-3
+    unit = rows[:, seen] / norms[seen]
+    variance = np.sum(np.square(r)) / (r.size - seen.sum())
+    known = np.concatenate([np.ravel(errors) for errors in result.standard_errors])
+    np.testing.assert_array_equal(np.isfinite(known), seen)
+    assert all(np.all(np.isinf(errors[beyond:])) for errors in result.standard_errors)
+    # A relative rounding of 1e-5 in the columns, times their condition number of 60.
+    np.testing.assert_allclose(known[seen], np.sqrt(variance * np.diag(np.linalg.inv(unit.T @ unit))) / norms[seen], rtol=1e-3)
+
+
 def test_unseen_entries_are_infinite():
     domain = jnp.array([0.0, 3.0])
     start = eqx.tree_at(lambda s: s.transfer.domain, START, domain)

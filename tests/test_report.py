@@ -62,6 +62,13 @@ def test_errors_belong_to_the_field_of_their_name(table):
         field_errors(table, {"transfer.rgb": sigma_t})
 
 
+def test_a_colour_that_may_be_any_is_undetermined(table):
+    rgb, sigma_t = ERRORS.values()
+    found = field_errors(table, {"rgb": np.where(np.arange(N)[:, None] == 2, 30.0, rgb), "sigma_t": 30 + sigma_t})
+    np.testing.assert_array_equal(np.flatnonzero(np.isinf(found["rgb"]).all(axis=1)), [2])
+    assert np.isfinite(found["sigma_t"]).all()
+
+
 # --- Transfer function -----------------------------------------------------------------------------------------------
 
 

@@ -102,7 +102,7 @@ class ChunkedLeastSquares(AbstractSolver):
         gradient, matrix = functions.quadratic(state.real, state.normal)
         diagonal = np.diag(matrix)
         scale = 1 / np.sqrt(np.maximum(diagonal, FLOOR * diagonal.max(initial=TINY)))
-        # A ridge far under the rounding of the sums keeps the factorisation alive in directions that no ray sees.
+        # A ridge under the rounding of the Jacobian keeps the factorisation alive in directions that no ray sees.
         scaled = scale[:, None] * matrix * scale + 1e-9 * np.eye(len(scale))
         model = (state.loss, scale * gradient, scaled)
         with jax.enable_x64(True):

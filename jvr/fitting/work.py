@@ -106,7 +106,7 @@ class Work:
             problem = eqx.tree_at(lambda p: p.loss, problem, SquaredError(), is_leaf=lambda x: isinstance(x, DSSIM))
         normal = self._sum(values, self.levels[-1], problem)
         measurements = 3 * int(jnp.sum(self.levels[-1].weight > 0))
-        return determination(normal.matrix, float(normal.squares), measurements)
+        return determination(normal.matrix, float(normal.squares), measurements, float(jnp.finfo(values.dtype).eps))
 
     def psnr(self, loss: float, normal: Normal | None) -> float:
         """Decibels relative to radiance 1, from the mean squared error where it is known, else from the objective."""
@@ -114,7 +114,7 @@ class Work:
         return float(-10 * np.log10(max(mean, 1e-20)))
 
     def _sum(self, values: Float[Array, "unknowns"], observations: Observations, problem: Problem | None = None) -> Normal:
-        """Chunks are summed in float64: what float32 would round away is what small eigenvalues are made of."""
+        """The normal equations of all chunks together, in float64."""
         parts = [normal_equations(problem or self.problem, values, piece) for piece in observations.chunks(self.chunk)]
         return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
 

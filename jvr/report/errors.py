@@ -15,7 +15,9 @@ def field_errors(
 
     **Arguments:** `standard_errors`: a mapping from fields, called `"rgb"` or, as `FitResult.errors_by_name` does,
     `"transfer.rgb"`; or a transfer function that holds errors in place of values. What is not a field of the transfer function is
-    left out. **Raises** `ValueError` where an error has not the shape of its field.
+    left out. The error of a colour that exceeds 1 becomes infinite: colours end there, so the images have not determined it.
+
+    **Raises** `ValueError` where an error has not the shape of its field.
     """
     if isinstance(standard_errors, AbstractTransfer):
         standard_errors = vars(standard_errors)
@@ -27,5 +29,6 @@ def field_errors(
             continue
         if np.shape(error) != np.shape(value):
             raise ValueError(f"the errors of {field} have shape {np.shape(error)}, its values {np.shape(value)}")
-        found[field] = np.asarray(error)
+        error = np.asarray(error)
+        found[field] = np.where(error > 1, np.inf, error) if field == "rgb" else error
     return found
