@@ -208,6 +208,15 @@ def test_dssim_needs_a_solver_that_uses_gradients():
     assert result.history[-1].loss < 0.5 * result.history[0].loss
 
 
+@pytest.mark.parametrize("keywords", [{"loss": jvr.AbsoluteError()}, {"priors": (jvr.ColourSmoothness(1e-2),)}])
+def test_psnr_is_that_of_the_pictures_whatever_is_made_small(keywords):
+    result = fit(solver=optx.OptaxMinimiser(optax.adam(0.1), rtol=0.0, atol=0.0), max_steps=6, **keywords)
+    rendered = np.concatenate([np.ravel(jvr.render(result.scene, c, SETTINGS).rgb) for c in CAMERAS])
+    target = np.concatenate([np.ravel(image) for image in IMAGES])
+    best = max(result.history, key=lambda entry: -entry.loss)
+    assert best.psnr == pytest.approx(-10 * np.log10(np.mean(np.square(rendered - target))), abs=0.01)
+
+
 def test_standard_errors_cover_the_truth():
     """Of 200 noisy repeats, 68 % of the fitted values lie within one standard error of the truth."""
     rng = np.random.default_rng(0)

@@ -247,9 +247,10 @@ def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool |
 
 
 def _iteration(work: Work, solver: AbstractSolver, state: Any, step: int, seconds: float) -> Iteration:
-    _, loss = solver.iterate(state)
+    real, loss = solver.iterate(state)
     level = int(getattr(state, "level", len(work.levels) - 1))
-    return Iteration(step, loss, work.psnr(loss, getattr(state, "normal", None)), seconds, work.levels[level].size / work.rays)
+    psnr = work.psnr(real, loss, getattr(state, "normal", None))
+    return Iteration(step, loss, psnr, seconds, work.levels[level].size / work.rays)
 
 
 def _worst(chosen: Unknowns, model: Exposed, known: Determination, most: int = 6) -> tuple[tuple[str, float], ...]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jvr.fitting.losses import AbstractPrior
+from jvr.fitting.losses import AbstractPrior, SquaredError
 from jvr.fitting.observations import Observations, Samples, observed_medium
 from jvr.fitting.unknowns import Exposed, Unknowns
 from jvr.march.differentiation import AbstractAdjoint, Forward, Replay
@@ -37,6 +37,10 @@ class Problem(eqx.Module):
 
     def with_samples(self, samples: Samples) -> "Problem":
         return Problem(self.model, self.unknowns, self.settings, self.loss, self.priors, samples)
+
+    def least_squares(self) -> "Problem":
+        """The same unknowns and data, the squared error alone."""
+        return Problem(self.model, self.unknowns, self.settings, SquaredError(), (), self.samples)
 
 
 class _Channel(NamedTuple):

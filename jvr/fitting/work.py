@@ -74,7 +74,8 @@ class Work:
         self.rays = observations.size
         self.total = _total(observations)
         self.levels = _levels(problem, observations, chunk)
-        self.functions = self._functions(observations, tuple(cameras), tuple(jnp.asarray(image) for image in images))
+        self.pieces = jax.tree.map(lambda x: x.reshape(-1, chunk, *x.shape[1:]), observations)
+        self.functions = self._functions(tuple(cameras), tuple(jnp.asarray(image) for image in images))
 
     def expand(self, level: int, real: Float[Array, "unknowns"]) -> tuple[float, Normal]:
         """The objective at `real`, over the rays of a level, and the normal equations in the unknowns' own values."""
@@ -103,14 +104,20 @@ class Work:
         problem = self.problem
         if isinstance(problem.loss, DSSIM):
             # A loss over whole images has no residual variance: the errors are those that its solution has as least squares.
-            problem = eqx.tree_at(lambda p: p.loss, problem, SquaredError(), is_leaf=lambda x: isinstance(x, DSSIM))
+            problem = problem.least_squares()
         normal = self._sum(values, self.levels[-1], problem)
         measurements = 3 * int(jnp.sum(self.levels[-1].weight > 0))
         return determination(normal.matrix, float(normal.squares), measurements, float(jnp.finfo(values.dtype).eps))
 
-    def psnr(self, loss: float, normal: Normal | None) -> float:
-        """Decibels relative to radiance 1, from the mean squared error where it is known, else from the objective."""
-        mean = float(normal.squares) if normal is not None else loss
+    def psnr(self, real: np.ndarray, loss: float, normal: Normal | None) -> float:
+        """Decibels relative to radiance 1. Where neither the objective nor what a solver knows is the mean squared error, that costs
+        a march of its own."""
+        if normal is not None:
+            mean = float(normal.squares)
+        elif isinstance(self.problem.loss, SquaredError) and not self.problem.priors:
+            mean = loss
+        else:
+            mean = float(_mean_squares(self.problem.least_squares(), jnp.asarray(real), self.pieces, jnp.asarray(self.total)))
         return float(-10 * np.log10(max(mean, 1e-20)))
 
     def _sum(self, values: Float[Array, "unknowns"], observations: Observations, problem: Problem | None = None) -> Normal:
@@ -118,13 +125,12 @@ class Work:
         parts = [normal_equations(problem or self.problem, values, piece) for piece in observations.chunks(self.chunk)]
         return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
 
-    def _functions(self, observations: Observations, cameras: tuple[AbstractCamera, ...], images: tuple[Array, ...]) -> Functions:
-        pieces = jax.tree.map(lambda x: x.reshape(-1, self.chunk, *x.shape[1:]), observations)
+    def _functions(self, cameras: tuple[AbstractCamera, ...], images: tuple[Array, ...]) -> Functions:
         if isinstance(self.problem.loss, DSSIM):
             function = ImageValueFunction(self.problem, cameras, images)
         else:
-            function = ValueFunction(self.problem, pieces, jnp.asarray(self.total))
-        residuals = ResidualFunction(self.problem, pieces, jnp.asarray(self.total))
+            function = ValueFunction(self.problem, self.pieces, jnp.asarray(self.total))
+        residuals = ResidualFunction(self.problem, self.pieces, jnp.asarray(self.total))
         levels = tuple(functools.partial(self.expand, i) for i in range(len(self.levels)))
         reach = self.problem.unknowns.reach(self.problem.model)
         return Functions(function, residuals, levels, reach, self.quadratic)
@@ -148,6 +154,9 @@ def _levels(problem: Problem, observations: Observations, chunk: int) -> tuple[O
     unknowns = sum(v.size for v in problem.unknowns.values(problem.model))
     every = min(MOST_THINNING, 3 * observations.size // max(LEAST_RESIDUALS * unknowns, chunk))
     return (observations,) if every < 2 else (thin(observations, every, chunk), observations)
+
+
+_mean_squares = eqx.filter_jit(value)
 
 
 @eqx.filter_jit
