@@ -28,7 +28,6 @@ from jvr.march.march import (
     Marched,
     MarchOptions,
     Medium,
-    add,
     integrate,
     lanes_of,
     march,
@@ -38,7 +37,7 @@ from jvr.march.march import (
     transmittance,
 )
 from jvr.march.steps import Rays, points_at, segment
-from jvr.numerics import one_minus_exp
+from jvr.numerics import one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
 
@@ -54,7 +53,7 @@ def _replay_forward(options: MarchOptions, *arguments: Any):
     end = integrate(options, *inputs, for_replay=True)
     # What is perturbed is known by which half of the inputs a leaf is in: a None in `wanted` asks for no derivative.
     wanted, fixed = eqx.partition(inputs, perturbed)
-    return marched(end), (wanted, fixed, end._replace(sums=None))
+    return marched(end), (wanted, fixed, end._replace(sums=None, steps=None))
 
 
 def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
@@ -83,7 +82,8 @@ class Behind(NamedTuple):
 
 
 class BackLanes(NamedTuple):
-    """A batch of rays that are walked backwards; `steps`, `front` and `last` are those of the forward march's `Progress`."""
+    """A batch of rays that are walked backwards, from segment `steps - 1` on; `front` and `last` are those of the forward march's
+    `Progress`."""
 
     lanes: Lanes
     steps: Int[Array, "rays"]
@@ -94,6 +94,14 @@ class BackLanes(NamedTuple):
         """The index of the `j`-th segment from the back, and the number of segments, 0 for rays that are done."""
         return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.lanes.segments, 0)
 
+    def leap(self, medium: Medium, dt: Scalar, j: Int[Array, "rays"]) -> Int[Array, "rays"]:
+        """The next segment from the back, from the `j`-th on, whose midpoint may lie in a visible brick, or the number of them."""
+        if medium.occupancy is None:
+            return j
+        rays = self.lanes.rays
+        _, u = segment(jnp.maximum(self.steps - 1 - j, 0), self.lanes.segments, rays.length, dt)
+        return jnp.minimum(j + medium.occupancy.leap(rays, u, dt, backwards=True), self.steps)
+
     def nothing_behind(self, emits: int, *, distance: bool) -> Behind:
         """What the last segment has behind it."""
         zero = jnp.zeros_like(self.lanes.rays.length)
@@ -103,12 +111,14 @@ class BackLanes(NamedTuple):
     def depth(self, j: Int[Array, "rays"], behind: Behind, dtau: Channels) -> tuple[Channels, Channels]:
         """Optical depth in front of the `j`-th segment from the back, whose own is `dtau`: infinite where nothing behind can be seen,
         given where the forward march has noted it, else that in front of the next segment less its own."""
-        k = self.steps - 1 - j
-        depths = []
-        for i, tau in enumerate(zip(*add(behind.tau, behind.tau_low, tuple(-d for d in dtau)), strict=True)):
-            given = (jnp.where(k == self.last[i], self.front[i], jnp.inf), jnp.zeros_like(tau[1]))
-            depths.append([jnp.where(k < self.last[i], found, known) for found, known in zip(tau, given, strict=True)])
-        return tuple(high for high, _ in depths), tuple(low for _, low in depths)
+        k, channels = self.steps - 1 - j, []
+        for front, last, high, low, d in zip(self.front, self.last, behind.tau, behind.tau_low, dtau, strict=True):
+            # What was noted holds in front of segment `last` and, where that was leapt over, behind the first one that is reached.
+            first = jnp.isinf(high)
+            high, low = jnp.where(first, front, high), jnp.where(first, 0.0, low)
+            high, low = two_sum(high, low, jnp.where(k < last, -d, 0.0))
+            channels.append((jnp.where(k > last, jnp.inf, high), jnp.where(k > last, 0.0, low)))
+        return tuple(high for high, _ in channels), tuple(low for _, low in channels)
 
 
 def step_back(
@@ -155,6 +165,9 @@ def replay(wanted: Any, fixed: Any, end: Any, cotangent: Marched) -> Any:
     **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `end`: the forward march's `Progress`.
     """
     medium, rays, dt = eqx.combine(wanted, fixed)
+    if jax.tree.leaves(wanted[0].transfer):
+        # An invisible brick may have a derivative: that of extinction at zero is not zero.
+        medium = medium._replace(occupancy=None)
     rays_mask = is_there(wanted[1])
     zeros = functools.partial(jax.tree.map, jnp.zeros_like)
 
@@ -169,13 +182,14 @@ def replay(wanted: Any, fixed: Any, end: Any, cotangent: Marched) -> Any:
     def advance(inputs: tuple[BackLanes, Marched], state: _ReplayState, total: _Gradients):
         return _replay_segment(medium, dt, *inputs, state, total)
 
-    inputs = (BackLanes(lanes_of(rays, dt), end.steps, end.front, end.last), cotangent)
+    inputs = (BackLanes(lanes_of(rays, dt), end.following, end.front, end.last), cotangent)
     total = _Gradients(zeros(wanted[0]), zeros(wanted[2]))
-    gradient, total = pooled_while(alive, advance, start, lambda state: state.gradient, inputs, total, end.steps)
+    gradient, total = pooled_while(alive, advance, start, lambda state: state.gradient, inputs, total, end.following)
     return total.medium, gradient, total.dt
 
 
 def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marched, state: _ReplayState, total: _Gradients):
+    state = state._replace(j=back.leap(medium, dt, state.j))
     lanes, (k, count) = back.lanes, back.at(state.j)
     # The field is not among `small`: it deposits its derivative itself, in place, through the tap.
     small_mask = is_there((total.medium.transfer, total.medium.shader, state.gradient, total.dt))
@@ -204,7 +218,7 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marc
     field = medium.field.deposit(total.medium.field, points, s_cotangent)
     behind = step_back(state.behind, front, emitted, dtau, u)
     state = _ReplayState(behind, state.j + (state.j < back.steps), ray_gradient)
-    return state, _Gradients(Medium(field, transfer, shader), dt_gradient)
+    return state, _Gradients(Medium(field, transfer, shader, total.medium.occupancy), dt_gradient)
 
 
 def is_there(tree: Any) -> Any:

@@ -35,10 +35,12 @@ class Replay(AbstractAdjoint):
 
 
 class Forward(AbstractAdjoint):
-    """Forward mode (`jvp`, `jacfwd`), for one or few directions. JAX refuses reverse mode through it: use `Replay()`."""
+    """Forward mode (`jvp`, `jacfwd`), for one or few directions; takes every sample. JAX refuses reverse mode through it: use
+    `Replay()`."""
 
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
-        return march(options, medium, rays, dt)
+        # What is skipped has no tangent, and the tangent of zero extinction is not zero.
+        return march(options, medium._replace(occupancy=None), rays, dt)
 
 
 class Rows(AbstractAdjoint):

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.march.batch import pooled_while
+from jvr.march.occupancy import Occupancy
 from jvr.march.steps import Point, Rays, points_at, segment, segment_count
 from jvr.model.transfer import AbstractTransfer, Classified
 from jvr.numerics import one_minus_exp, two_sum
@@ -44,11 +45,12 @@ class AbstractShader(eqx.Module):
 
 
 class Medium(NamedTuple):
-    """What rays march through: resampled, classified, shaded."""
+    """What rays march through: resampled, classified, shaded; where `occupancy` is not `None`, only in visible bricks."""
 
     field: AbstractField
     transfer: AbstractTransfer
     shader: AbstractShader
+    occupancy: Occupancy | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +66,7 @@ class Marched(NamedTuple):
 
     `radiance`: three components, or none where nothing is emitted; `tau`: optical depth, one or three components, or none;
     `distance`: opacity-weighted distance from the entry, not yet divided by the opacity, a component for each of `tau`, or none;
-    `steps`: segments taken, `None` in a derivative.
+    `steps`: segments that were sampled, `None` in a derivative.
     """
 
     radiance: Channels
@@ -93,10 +95,11 @@ class Lanes(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """How far a ray has come: its sums, the segments it took and, for each channel of optical depth, the last segment that light
-    from behind could still reach the eye through (`last`), with the optical depth in front of it (`front`)."""
+    """How far a ray has come: its sums, the segment that comes next, how many it sampled and, for each channel of optical depth, the
+    last segment that light from behind could still reach the eye through (`last`), with the optical depth in front of it (`front`)."""
 
     sums: Sums
+    following: Int[Array, "rays"]
     steps: Int[Array, "rays"]
     front: Channels
     last: tuple[Int[Array, "rays"], ...]
@@ -119,27 +122,30 @@ def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar, *, 
         zero = jnp.zeros_like(lanes.rays.length)
         blank = (zero,) * absorbs
         sums = Sums((zero,) * emits, (zero,) * emits, blank, blank, blank * options.distance)
-        no_steps = jnp.zeros_like(lanes.segments)
-        return Progress(sums, no_steps, blank * for_replay, (no_steps,) * absorbs * for_replay)
+        none = jnp.zeros_like(lanes.segments)
+        return Progress(sums, none, none, blank * for_replay, (none,) * absorbs * for_replay)
 
     def advance(lanes: Lanes, progress: Progress, _: None) -> tuple[Progress, None]:
+        k = jnp.where(is_alive(options, lanes, progress), leap(medium, lanes, dt, progress.following), progress.following)
+        leapt, progress = k > progress.following, progress._replace(following=k)
         alive = is_alive(options, lanes, progress)
-        sums = progress.sums
-        emitted, dtau, u = take_segment(medium, lanes, dt, progress.steps, jnp.where(alive, lanes.segments, 0))
-        front, last = note_front(progress, alive) if for_replay else ((), ())
-        return Progress(add_segment(sums, emitted, dtau, u), progress.steps + alive, front, last), None
+        emitted, dtau, u = take_segment(medium, lanes, dt, k, jnp.where(alive, lanes.segments, 0))
+        # Where a ray ends with a leap, the last segment that it leapt over is the one to be noted.
+        front, last = note_front(progress, alive | leapt, k - ~alive) if for_replay else ((), ())
+        sums = add_segment(progress.sums, emitted, dtau, u)
+        return Progress(sums, k + alive, progress.steps + alive, front, last), None
 
     lanes = lanes_of(rays, dt)
     alive = functools.partial(is_alive, options)
     return pooled_while(alive, advance, start, lambda progress: progress, lanes, None, lanes.segments)[0]
 
 
-def note_front(progress: Progress, alive: Bool[Array, "rays"]) -> tuple[Channels, tuple[Int[Array, "rays"], ...]]:
-    """`front` and `last` of `progress` as the next segment is about to be taken."""
+def note_front(progress: Progress, moved: Bool[Array, "rays"], k: Int[Array, "rays"]):
+    """`front` and `last` as the rays that have `moved` are in front of segment `k`."""
     depth = join(progress.sums.tau, progress.sums.tau_low)
-    clear = [alive & (now < opaque_depth(now.dtype)) for now in depth]
+    clear = [moved & (now < opaque_depth(now.dtype)) for now in depth]
     front = tuple(jnp.where(c, now, old) for c, now, old in zip(clear, depth, progress.front, strict=True))
-    last = tuple(jnp.where(c, progress.steps, old) for c, old in zip(clear, progress.last, strict=True))
+    last = tuple(jnp.where(c, k, old) for c, old in zip(clear, progress.last, strict=True))
     return front, last
 
 
@@ -153,6 +159,14 @@ def marched(progress: Progress) -> Marched:
     """The sums of every ray, rounded to one float each."""
     sums = progress.sums
     return Marched(join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), sums.distance, progress.steps)
+
+
+def leap(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"]) -> Int[Array, "rays"]:
+    """The next segment, from `k` on, whose midpoint may lie in a visible brick, or the number of segments."""
+    if medium.occupancy is None:
+        return k
+    _, u = segment(k, lanes.segments, lanes.rays.length, dt)
+    return jnp.minimum(k + medium.occupancy.leap(lanes.rays, u, dt), lanes.segments)
 
 
 def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
@@ -198,7 +212,7 @@ def opacity(before: Channels, dtau: Channels) -> Channels:
 
 def is_alive(options: MarchOptions, lanes: Lanes, progress: Progress) -> Bool[Array, "rays"]:
     """Whether the next segment of each ray is to be taken: it lies inside, and something of it can still reach the eye."""
-    alive = progress.steps < lanes.segments
+    alive = progress.following < lanes.segments
     if progress.sums.tau:
         thinnest = functools.reduce(jnp.minimum, progress.sums.tau)
         # Even without a bound: behind so much nothing can be seen.

@@ -70,8 +70,8 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
         rows = jax.tree.map(lambda row, w: row + sum(hats[i] * w[i][:, None] for i in range(BLOCK)), state.rows, weights)
         return _RowState(behind, j, rows), None
 
-    back = BackLanes(lanes_of(rays, dt), end.steps, end.front, end.last)
-    rows, _ = pooled_while(alive, advance, start, lambda state: state.rows, back, None, end.steps)
+    back = BackLanes(lanes_of(rays, dt), end.following, end.front, end.last)
+    rows, _ = pooled_while(alive, advance, start, lambda state: state.rows, back, None, end.following)
     return marched(end), rows
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import float_array, require
 from jvr.numerics import divide_or_zero, read_run
@@ -31,6 +31,10 @@ class AbstractTransfer(eqx.Module):
     def evaluate(self, s: Scalar) -> Classified:
         """Colour and extinction at one scalar value; traceable and differentiable in `s` and in every array."""
 
+    @abc.abstractmethod
+    def is_visible(self, low: Scalar, high: Scalar) -> Bool[Array, ""]:
+        """Whether any value from `low` to `high` may have extinction other than zero; never falsely `False`."""
+
 
 class AbstractTable(AbstractTransfer):
     """A transfer function that interpolates the rows of a table linearly, colour and extinction separately."""
@@ -40,6 +44,13 @@ class AbstractTable(AbstractTransfer):
     @abc.abstractmethod
     def coordinate(self, s: Scalar) -> Scalar:
         """Where `s` falls in the table, 0 ... n-1, clamped; entry `i` has weight `max(0, 1 - |coordinate - i|)`."""
+
+    def is_visible(self, low: Scalar, high: Scalar) -> Bool[Array, ""]:
+        # Entries that are not zero are counted: a difference of sums of the extinctions themselves would round small ones away.
+        lit = self.sigma_t.reshape(self.sigma_t.shape[0], -1) != 0
+        before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(jnp.any(lit, axis=1), dtype=jnp.int32)])
+        first, last = (jnp.floor(self.coordinate(s)).astype(jnp.int32) for s in (low, high))
+        return before[jnp.minimum(last + 2, before.size - 1)] > before[first]
 
 
 class LinearTransfer(AbstractTable):
@@ -150,6 +161,12 @@ class GaussianTransfer(AbstractTransfer):
         weight = height * jnp.exp(jnp.minimum(exponent - largest, 0.9 * jnp.log(limit)))
         weight = divide_or_zero(weight, jnp.broadcast_to(jnp.sum(weight), weight.shape))
         return Classified(_three(self.rgb.T @ weight), sigma_t)
+
+    def is_visible(self, low: Scalar, high: Scalar) -> Bool[Array, ""]:
+        # The largest extinction of each Gaussian in the range: at its centre, or at the end nearer to it. Zero is where it underflows.
+        nearest = jnp.clip(self.center, low, high)
+        height = self.height if self.height.ndim == 1 else jnp.max(self.height, axis=1)
+        return jnp.any(height * jnp.exp(-0.5 * jnp.square((nearest - self.center) / self.width)) != 0)
 
 
 def _colour(rgb: ArrayLike, n: int) -> Float[Array, "n 3"]:

@@ -4,9 +4,11 @@ import abc
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.checks import affine, float_array, require
 from jvr.numerics import read_run
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
@@ -70,6 +72,8 @@ class Volume(eqx.Module):
     - `slope`, `intercept`: scalars, default 1 and 0, as DICOM's rescale.
     - `interpolation`: `Trilinear()` (default) or `Nearest()`.
 
+    `bricks` is `None` until `bricked()` makes them.
+
     **Raises** `ValueError` for another number of dimensions, an empty array or a singular transform, `TypeError` for voxels
     that are not real numbers. Everything but `interpolation` is an array and differentiable.
     """
@@ -79,6 +83,7 @@ class Volume(eqx.Module):
     slope: Scalar
     intercept: Scalar
     interpolation: AbstractInterpolation
+    bricks: Bricks | None
 
     def __init__(
         self,
@@ -103,6 +108,18 @@ class Volume(eqx.Module):
         self.slope = float_array(slope, "slope", ())
         self.intercept = float_array(intercept, "intercept", ())
         self.interpolation = interpolation
+        self.bricks = None
+
+    def bricked(self, size: int = 4) -> "Volume":
+        """The same volume with the bounds of its bricks of `size^3` voxels, which empty-space skipping needs; without them each
+        picture computes them anew. They take `2 / size^3` of the voxels' memory.
+
+        They belong to these voxels: after replacing `values`, call it again. **Raises** `ValueError` where `size` is below 1.
+        """
+        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+            raise ValueError(f"the size of a brick must be a positive whole number of voxels, not {size!r}; 4 is a good start")
+        bricks = jax.jit(bricks_of, static_argnums=1)(jax.lax.stop_gradient(self.values), size)
+        return eqx.tree_at(lambda v: v.bricks, self, bricks, is_leaf=lambda x: x is None)
 
     @property
     def shape(self) -> tuple[int, int, int]:

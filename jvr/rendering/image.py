@@ -6,17 +6,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jvr.march.march import Marched, MarchOptions
+from jvr.march.occupancy import Occupancy
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
-from jvr.rendering.plan import medium
+from jvr.rendering.plan import medium, occupancy
 from jvr.rendering.settings import Settings
 from jvr.types import Image, Scalar, Triple
 
 
 class RenderStats(eqx.Module):
-    """What a rendering took: `steps`, segments marched for each pixel, `(height, width)`."""
+    """What a rendering took: `steps`, segments sampled for each pixel, `(height, width)`."""
 
     steps: Int[Array, "height width"]
 
@@ -45,22 +46,30 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
     with non-finite numbers gives NaN pixels.
     """
     pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
+    where = occupancy(scene, settings)
     if pixels.size <= settings.tile:
-        rgb, alpha, depth, steps = _render_pixels(scene, camera, settings, pixels)
+        rgb, alpha, depth, steps = _render_pixels(scene, camera, settings, where, pixels)
     else:
-        rgb, alpha, depth, steps = _render_tiles(scene, camera, settings, pixels)
+        rgb, alpha, depth, steps = _render_tiles(scene, camera, settings, where, pixels)
     shape = (camera.height, camera.width)
     return Rendering(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape), RenderStats(steps.reshape(shape)))
 
 
 def trace(
-    scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], *, distance: bool = False
+    scene: Scene,
+    camera: AbstractCamera,
+    settings: Settings,
+    pixels: Int[Array, "rays"],
+    *,
+    where: Occupancy | None = None,
+    distance: bool = False,
 ) -> tuple[Marched, Rays, Float[Array, "rays"]]:
-    """Marches the rays of some pixels; returns what they gathered, the rays, and the distance from the eye to their entry."""
+    """Marches the rays of some pixels, only `where` there is something to see; returns what they gathered, the rays, and the distance
+    from the eye to their entry."""
     scene, camera = one_precision(scene, camera)
     rays, t_in = enter(scene, *camera.rays(pixels))
     options = MarchOptions(settings.termination, distance)
-    return settings.adjoint.march(options, medium(scene), rays, step_length(scene, settings)), rays, t_in
+    return settings.adjoint.march(options, medium(scene, where), rays, step_length(scene, settings)), rays, t_in
 
 
 def one_precision(scene: Scene, camera: AbstractCamera) -> tuple[Scene, AbstractCamera]:
@@ -114,8 +123,8 @@ def composite(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> 
     return rgb, alpha
 
 
-def _render_pixels(scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"]):
-    gathered, rays, t_in = trace(scene, camera, settings, pixels, distance=True)
+def _render_pixels(scene: Scene, camera: AbstractCamera, settings: Settings, where: Occupancy | None, pixels: Int[Array, "rays"]):
+    gathered, rays, t_in = trace(scene, camera, settings, pixels, where=where, distance=True)
     rgb, alpha = composite(scene, gathered, rays.length)
     weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
     depth = jnp.where(alpha > 0, t_in + divide_or_zero(weighted, alpha), 0.0)
@@ -123,9 +132,9 @@ def _render_pixels(scene: Scene, camera: AbstractCamera, settings: Settings, pix
     return jnp.stack(rgb, axis=-1), alpha, depth, gathered.steps
 
 
-def _render_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"]):
+def _render_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, where: Occupancy | None, pixels: Int[Array, "rays"]):
     count = -(-pixels.size // settings.tile)
     # The last tile repeats the last pixel; what it computes for it is dropped.
     padded = jnp.minimum(jnp.arange(count * settings.tile, dtype=jnp.int32), pixels.size - 1).reshape(count, settings.tile)
-    tiles = jax.lax.map(lambda tile: _render_pixels(scene, camera, settings, tile), padded)
+    tiles = jax.lax.map(lambda tile: _render_pixels(scene, camera, settings, where, tile), padded)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: pixels.size], tiles)

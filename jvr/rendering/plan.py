@@ -6,10 +6,13 @@ import jax
 
 from jvr.march.fields import VoxelField
 from jvr.march.march import AbstractShader, Medium
+from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.steps import Point
+from jvr.model.bricks import bricks_of
 from jvr.model.optical import AbstractOpticalModel, EmissionOnly
 from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
+from jvr.model.volume import Volume
 from jvr.rendering.settings import Settings
 from jvr.types import Channels, Scalar
 
@@ -23,9 +26,24 @@ class OpticalShader(AbstractShader):
         return self.optical.segment(medium, dt)
 
 
-def medium(scene: Scene) -> Medium:
+def medium(scene: Scene, occupancy: Occupancy | None = None) -> Medium:
     """What of a scene rays march through."""
-    return Medium(VoxelField(scene.volume), scene.transfer, OpticalShader(scene.optical))
+    return Medium(VoxelField(scene.volume), scene.transfer, OpticalShader(scene.optical), occupancy)
+
+
+def occupancy(scene: Scene, settings: Settings) -> Occupancy | None:
+    """Which bricks of a scene are visible, or `None` where nothing is to be skipped."""
+    if not settings.skipping:
+        return None
+    volume = scene.volume
+    bricks = bricks_of(jax.lax.stop_gradient(volume.values)) if volume.bricks is None else volume.bricks
+    return occupancy_of(bricks, volume.slope, volume.intercept, scene.transfer)
+
+
+def _skipping(volume: Volume) -> str:
+    if volume.bricks is None:
+        return "bricks are bounded anew for each picture: jvr.Volume.bricked() does it once"
+    return f"bricks of {volume.bricks.size}^3 voxels"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +82,7 @@ def plan(scene: Scene, settings: Settings = Settings()) -> Plan:
         Part("volume", True, f"{voxels}, {type(volume.interpolation).__name__.lower()}, a sample every {settings.step:g} voxels"),
         Part("transfer", True, f"{type(transfer).__name__}, {'coloured' if coloured else 'grey'} extinction"),
         Part("optical model", True, type(scene.optical).__name__),
+        Part("empty-space skipping", settings.skipping, _skipping(volume) if settings.skipping else "every sample is taken"),
         Part(
             "early termination", settings.termination > 0 and not transparent, "nothing absorbs" if transparent else termination
         ),
