@@ -1,30 +1,35 @@
-"""`python -m benchmarks [NAME ...] [--json FILE]`."""
+"""`python -m benchmarks [NAME ...] [--json FILE] [--quick]`."""
 
 import argparse
+import datetime
 import json
 import os
 import platform
 import sys
+from pathlib import Path
 
 import jax
 
 import jvr
 from benchmarks.cases import CASES
+from benchmarks.peers.run import peers
 
 
 def main() -> None:
     """Runs the named measurements, all by default, and prints one JSON object."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(CASES)}; all by default")
+    names = [*CASES, "peers"]
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)}; all by default")
     parser.add_argument("--json", metavar="FILE", help="also write the result to FILE")
+    parser.add_argument("--quick", action="store_true", help="peers: small sizes and few rounds, to see that it runs")
     arguments = parser.parse_args()
-    unknown = set(arguments.names) - set(CASES)
+    unknown = set(arguments.names) - set(names)
     if unknown:
-        parser.error(f"unknown benchmark {', '.join(sorted(unknown))}: choose from {', '.join(CASES)}")
+        parser.error(f"unknown benchmark {', '.join(sorted(unknown))}: choose from {', '.join(names)}")
     result = {"machine": machine()}
-    for name in arguments.names or CASES:
+    for name in arguments.names or names:
         print(f"{name} ...", file=sys.stderr, flush=True)
-        result[name] = CASES[name]()
+        result[name] = peers(arguments.quick) if name == "peers" else CASES[name]()
     text = json.dumps(result, indent=2)
     print(text)
     if arguments.json:
@@ -35,6 +40,8 @@ def main() -> None:
 def machine() -> dict[str, str | int | None]:
     """What the numbers were measured on."""
     return {
+        "date": datetime.date.today().isoformat(),
+        "processor": processor(),
         "device": jax.devices()[0].device_kind,
         "cores": os.cpu_count(),
         "platform": platform.platform(terse=True),
@@ -42,6 +49,13 @@ def machine() -> dict[str, str | int | None]:
         "jax": jax.__version__,
         "jvr": jvr.__version__,
     }
+
+
+def processor() -> str:
+    """Its name, where the system says."""
+    described = Path("/proc/cpuinfo")
+    lines = described.read_text().splitlines() if described.exists() else []
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.processor())
 
 
 if __name__ == "__main__":

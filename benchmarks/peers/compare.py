@@ -1,0 +1,67 @@
+"""Pictures at equal error, and times in turns."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from benchmarks.peers.settings import STEPS
+from benchmarks.peers.worker import Worker
+
+# How near to its best a renderer must come before a longer step is preferred.
+NEAR_BEST = 1.05
+
+
+@contextlib.contextmanager
+def running(names: list[str], *arguments: Any) -> Iterator[tuple[dict[str, Worker], dict[str, str]]]:
+    """Workers that have loaded a scene, and the reasons of those that could not."""
+    with contextlib.ExitStack() as stack:
+        workers, failed = {}, {}
+        for name in names:
+            try:
+                workers[name] = stack.enter_context(Worker(name)).load(*arguments)
+            except RuntimeError as error:
+                failed[name] = str(error)
+        yield workers, failed
+
+
+def error_at(worker: Worker, step: float, reference: np.ndarray) -> float:
+    """Draws with a step, and compares."""
+    worker.call("prepare", step)
+    worker.call("draw")
+    return worker.call("error", reference)
+
+
+def near_best(worker: Worker, reference: np.ndarray) -> tuple[float, float]:
+    """The longest step whose error is within 5 % of the smallest that the renderer reaches, and that error."""
+    errors = {step: error_at(worker, step, reference) for step in STEPS}
+    limit = NEAR_BEST * min(errors.values())
+    return next((step, error) for step, error in errors.items() if error <= limit)
+
+
+def longest_step(worker: Worker, reference: np.ndarray, target: float) -> tuple[float, float]:
+    """The longest step whose error is at most `target`, and that error; where none is, that of the smallest error met.
+
+    By bisection, since a step may cost a compilation: the error is taken to grow with the step.
+    """
+    errors: dict[float, float] = {}
+    low, high = 0, len(STEPS)
+    while low < high:
+        middle = (low + high) // 2
+        step = STEPS[middle]
+        errors[step] = error_at(worker, step, reference)
+        low, high = (low, middle) if errors[step] <= target else (middle + 1, high)
+    good = [step for step, error in errors.items() if error <= target]
+    chosen = max(good) if good else min(errors, key=lambda step: errors[step])
+    return chosen, errors[chosen]
+
+
+def in_turns(functions: dict[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
+    """Seconds of each function, which measures itself; in turns, so that a slow minute of the machine hits all of them alike. The
+    first round is dropped."""
+    times = {name: [] for name in functions}
+    for _ in range(repeats + 1):
+        for name, function in functions.items():
+            times[name].append(function())
+    return {name: measured[1:] for name, measured in times.items()}
