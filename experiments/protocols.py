@@ -24,9 +24,10 @@ class Protocol:
     held_out: tuple[tuple[jvr.PerspectiveCamera, ...], list[np.ndarray]]
 
 
-def ct_head(entries: int = 64, size: int = 128) -> Protocol | None:
-    """A CT of a head (64 x 64 x 93), 8 views of 128^2, samples every millimetre; `None` where the volume is absent."""
-    volume = head_volume()
+def ct_head(entries: int = 64, size: int = 128, volume: jvr.Volume | None = None) -> Protocol | None:
+    """A CT of a head (64 x 64 x 93) or another volume in its place, 8 views of 128^2, samples every millimetre; `None` where the
+    head is absent."""
+    volume = volume or head_volume()
     if volume is None:
         return None
     return _protocol(volume, size, entries, jvr.Settings(1 / 1.5, termination=0.0), None)
