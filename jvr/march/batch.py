@@ -16,6 +16,10 @@ Results = TypeVar("Results")
 POOL = 8192
 # The share of lanes that may idle before they are filled again.
 IDLE = 0.25
+# Neighbouring rays that are put in order together.
+TOGETHER = 16
+# Lanes of the smaller pool that the last rays end in, so that a few long ones do not pay for all the others' lanes.
+TAIL = 1024
 
 
 def pooled_while(
@@ -31,34 +35,35 @@ def pooled_while(
 
     `inputs` and what `finish` returns are pytrees of arrays with a leading axis of rays; `start` makes the state of a batch from its
     inputs; `shared` is carried along. `advance` must leave a finished lane as it is. Rays with more `work` to do start first, so
-    that no long ray is left alone at the end. Results come in the order of `inputs`.
+    that no long ray is left alone at the end; rays without any are not started, and their results are zero. Results come in the
+    order of `inputs`.
 
-    Finished rays are thus not paid for, memory in flight does not grow with the picture, and there is one loop to compile.
+    Finished rays are thus not paid for, and memory in flight does not grow with the picture.
     """
-    size = work.shape[0]
-    if size <= POOL:
+    if work.shape[0] <= POOL:
         state, shared = jax.lax.while_loop(
             lambda carry: jnp.any(alive(inputs, carry[0])), lambda carry: advance(inputs, *carry), (start(inputs), shared)
         )
         return finish(state), shared
-    queue = jnp.argsort(-work).astype(jnp.int32)
+    queue, size = _longest_first(work)
     take = lambda index: jax.tree.map(lambda x: x[index], inputs)
     index = queue[:POOL]
     own = take(index)
     state = start(own)
-    results = jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), jax.eval_shape(finish, state))
+    results = jax.tree.map(lambda x: jnp.zeros((work.shape[0], *x.shape[1:]), x.dtype), jax.eval_shape(finish, state))
+    put = lambda results, index, state: jax.tree.map(lambda r, x: r.at[index].set(x, mode="drop"), results, finish(state))
 
-    def working(carry):
+    def filling(carry):
         own, state, _, _, following, _ = carry
-        return (following < size) | jnp.any(alive(own, state))
+        return (following < size) | (jnp.sum(alive(own, state)) > TAIL)
 
     def drain_and_fill(carry):
         own, state, shared, index, following, results = carry
-        enough = jnp.where(following < size, int(POOL * (1 - IDLE)), 0)
+        enough = jnp.where(following < size, int(POOL * (1 - IDLE)), TAIL)
         state, shared = jax.lax.while_loop(
             lambda c: jnp.sum(alive(own, c[0])) > enough, lambda c: advance(own, *c), (state, shared)
         )
-        results = jax.tree.map(lambda all_, some: all_.at[index].set(some, unique_indices=True), results, finish(state))
+        results = put(results, index, state)
         idle = ~alive(own, state)
         place = following + jnp.cumsum(idle, dtype=jnp.int32) - 1
         fill = idle & (place < size)
@@ -69,8 +74,28 @@ def pooled_while(
         return own, state, shared, index, following, results
 
     carry = (own, state, shared, index, jnp.int32(POOL), results)
-    _, _, shared, _, _, results = jax.lax.while_loop(working, drain_and_fill, carry)
-    return results, shared
+    own, state, shared, index, _, results = jax.lax.while_loop(filling, drain_and_fill, carry)
+    # Lanes that are not alive are done and written; the last of them fill up the smaller pool, and are written again.
+    lanes = jnp.argsort(~alive(own, state))[:TAIL]
+    index, state = index[lanes], jax.tree.map(lambda x: x[lanes], state)
+    own = take(index)
+    state, shared = jax.lax.while_loop(lambda c: jnp.any(alive(own, c[0])), lambda c: advance(own, *c), (state, shared))
+    return put(results, index, state), shared
+
+
+def _longest_first(work: Int[Array, "rays"]) -> tuple[Int[Array, "queue"], Int[Array, ""]]:
+    """Indices of rays by falling `work`, and how many of them there are to start. Neighbours stay together: sorting rays one by one
+    takes ten times as long, and rays side by side read the same voxels."""
+    rays = work.shape[0]
+    most = jnp.max(jnp.pad(work, (0, -rays % TOGETHER)).reshape(-1, TOGETHER), axis=1)
+    first = jnp.argsort(-most).astype(jnp.int32) * TOGETHER
+    queue = (first[:, None] + jnp.arange(TOGETHER, dtype=jnp.int32)).ravel()
+    busy = TOGETHER * jnp.sum(most > 0, dtype=jnp.int32)
+    if queue.size > rays:
+        # The last group is not full. What fills it up is no ray and must not be started.
+        queue = queue[jnp.nonzero(queue < rays, size=rays)[0]]
+        busy -= jnp.where(most[-1] > 0, -rays % TOGETHER, 0).astype(jnp.int32)
+    return queue, busy
 
 
 def _where(mask: Bool[Array, "lanes"], new: Array, old: Array) -> Array:

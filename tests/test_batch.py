@@ -1,0 +1,55 @@
+"""The pool of lanes: every ray is advanced as often as it has work, whatever the sizes, and results keep their order."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jvr.march import batch
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch):
+    for name, value in {"POOL": 64, "TAIL": 8, "TOGETHER": 4}.items():
+        monkeypatch.setattr(batch, name, value)
+
+
+def run(work: np.ndarray):
+    """Counts steps per ray, sums a ray's own number once a step, and counts all steps in the shared state."""
+
+    def advance(inputs, state, shared):
+        number, work = inputs
+        alive = state[0] < work
+        return (state[0] + alive, state[1] + jnp.where(alive, number, 0)), shared + jnp.sum(alive)
+
+    def start(inputs):
+        return jnp.zeros_like(inputs[1]), jnp.zeros_like(inputs[0])
+
+    inputs = (jnp.arange(1, work.size + 1), jnp.asarray(work))
+    alive = lambda inputs, state: state[0] < inputs[1]
+    finish = lambda state: {"steps": state[0], "sum": state[1]}
+    return batch.pooled_while(alive, advance, start, finish, inputs, jnp.int32(0), inputs[1])
+
+
+@given(st.integers(1, 400), st.integers(0, 2**31), st.sampled_from([0.0, 0.5, 0.95]))
+@settings(max_examples=40, deadline=None)
+def test_every_ray_is_worked_off(size, seed, idle):
+    rng = np.random.default_rng(seed)
+    work = rng.geometric(0.05, size).astype(np.int32) * (rng.random(size) >= idle)
+    results, total = run(work)
+    np.testing.assert_array_equal(results["steps"], work)
+    np.testing.assert_array_equal(results["sum"], work * np.arange(1, size + 1))
+    assert total == work.sum()
+
+
+@pytest.mark.parametrize("size", [63, 64, 65, 71, 72, 73, 257])
+@pytest.mark.parametrize("fill", [0, 3])
+def test_edges(size, fill):
+    """Nothing to do at all, everything alike, and one straggler."""
+    work = np.full(size, fill, np.int32)
+    work[-1] = 50
+    results, total = jax.jit(lambda: run(work))()
+    np.testing.assert_array_equal(results["steps"], work)
+    assert total == work.sum()
