@@ -106,12 +106,15 @@ def main() -> None:
 def figure(results: dict[str, jvr.FitResult], path: str) -> None:
     """PSNR of the rays in use against seconds."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     drawing = Figure(figsize=(7, 4), layout="constrained")
     axes = drawing.subplots()
     for name, result in results.items():
         axes.plot([e.seconds for e in result.history], [e.psnr for e in result.history], marker=".", label=name)
     axes.set(xlabel="seconds", ylabel="PSNR (dB)", xscale="log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.legend(frameon=False)
     drawing.savefig(path, dpi=150)
 
