@@ -39,7 +39,7 @@ def results(run: dict[str, Any]) -> str:
     """All tables of a run, as Markdown."""
     peers = run["peers"]
     figures = [[FIGURES.get(name, name.replace("_", " ")), _number(value)] for name, value in peers["figures"].items()]
-    parts: list[str] = [_machine(run), "### Figures", _table(["figure", "ratio"], figures), "### Where jvr loses", losses(peers)]
+    parts: list[str] = [_machine(run), "### Figures", _table(["figure", "ratio"], figures), "### Where jvr loses", *losses(peers)]
     sections = {
         "Pictures": ("forward", "jvr_over", "jvr / {}"),
         "Pictures of a growing sparse volume": ("growth", "jvr_over", "jvr / {}"),
@@ -49,40 +49,46 @@ def results(run: dict[str, Any]) -> str:
     for title, (name, key, ratio) in sections.items():
         parts += [f"### {title}", _rows(peers[name], key, ratio)]
     absorbing = peers["absorption"]
-    parts += ["### Absorbing medium", absorbing.get("skipped") or _rows([absorbing], "over_jvr", "{} / jvr")]
-    parts += [f"Single scattering: {peers['single_scattering']['skipped']}."]
+    parts += ["### Absorbing medium", _rows([absorbing], "over_jvr", "{} / jvr")]
+    parts += [f"Single scattering: {peers['single_scattering']['failed']}."]
     parts += ["### Fit", _fit(peers["fit"])]
     return "\n\n".join(parts)
 
 
-def losses(peers: dict[str, Any]) -> str:
-    """Every comparison in which a peer was faster or `jvr` took more memory, worst first."""
-    found = []
+def losses(peers: dict[str, Any]) -> list[str]:
+    """Every comparison in which a peer was faster, and every one in which it took less memory, worst first."""
+    slower, larger = [], []
     for table, what in (("forward", "picture"), ("growth", "picture"), ("gradient", "gradient"), ("gradient_growth", "gradient")):
-        for row in peers[table]:
-            slower = {**row.get("jvr_over", {}), **{name: 1 / value for name, value in row.get("over_jvr", {}).items()}}
-            found += [(ratio, f"{what} of {_about(row)}", name, "time") for name, ratio in slower.items() if ratio > 1]
-            found += _more_memory(row, f"{what} of {_about(row)}")
-    rows = [[what, NAMES[name], kind, f"{ratio:.1f}"] for ratio, what, name, kind in sorted(found, reverse=True)]
-    return _table(["what", "against", "of", "jvr / peer"], rows) if rows else "Nowhere in this run."
+        for row in (row for row in peers[table] if "failed" not in row):
+            title = f"{what} of {_about(row)}"
+            over = {**row.get("jvr_over", {}), **{name: 1 / value for name, value in row.get("over_jvr", {}).items()}}
+            slower += [(ratio, title, name) for name, ratio in over.items() if ratio > 1]
+            larger += _more_memory(row, title)
+    tables = []
+    for kind, found in (("time", slower), ("memory", larger)):
+        rows = [[title, NAMES[name], f"{ratio:.1f}"] for ratio, title, name in sorted(found, reverse=True)]
+        tables.append(_table([f"in {kind}", "against", "jvr / peer"], rows) if rows else f"In {kind} nowhere in this run.")
+    return tables
 
 
-def _more_memory(row: dict[str, Any], what: str) -> list[tuple[float, str, str, str]]:
+def _more_memory(row: dict[str, Any], title: str) -> list[tuple[float, str, str]]:
     takers = {name: taker["peak_bytes"] for name, taker in row["renderers"].items() if "peak_bytes" in taker}
-    return [(takers["jvr"] / taken, what, name, "memory") for name, taken in takers.items() if takers["jvr"] > taken > 0]
+    return [(takers["jvr"] / taken, title, name) for name, taken in takers.items() if takers["jvr"] > taken > 0]
 
 
 def _machine(run: dict[str, Any]) -> str:
     machine, peers = run["machine"], run["peers"]
     lines = [
-        f"Measured on {machine['date']}: {machine['processor']}, {machine['platform']}, Python {machine['python']}; "
+        f"Measured on {machine['date']}: {machine['processor']}, Python {machine['python']}; "
         f"{peers['threads']} of {machine['cores']} cores used.",
         "; ".join(f"{NAMES[name]} {version}" for name, version in peers["versions"].items()) + ".",
+        f"The GPU mapper ran on {peers['opengl']}." if peers["opengl"] else "",
+        f"Load of the machine before and after: {peers['load'][0]:.1f}, {peers['load'][1]:.1f}.",
         *(f"{NAMES[name]}: absent ({why})." for name, why in peers["absent"].items()),
     ]
     if peers["quick"]:
         lines.append("**A quick run: small sizes and few rounds, not to be quoted.**")
-    return "\n".join(lines)
+    return "\n".join(line for line in lines if line)
 
 
 def _rows(rows: list[dict[str, Any]], key: str, ratio: str) -> str:
@@ -90,6 +96,9 @@ def _rows(rows: list[dict[str, Any]], key: str, ratio: str) -> str:
     head = ["scene", "renderer", "step (voxels)", "RMSE", "seconds", "peak MB", ratio.format("peer")]
     lines = []
     for row in rows:
+        if "failed" in row:
+            lines.append([f"failed: {row['failed']}", *[""] * (len(head) - 1)])
+            continue
         for name, taken in row["renderers"].items():
             if "failed" in taken:
                 lines.append([_about(row), NAMES[name], f"failed: {taken['failed']}", "", "", "", ""])
