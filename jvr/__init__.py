@@ -25,6 +25,8 @@ from jvr.model.volume import Volume as Volume
 from jvr.rendering.image import Rendering as Rendering
 from jvr.rendering.image import RenderStats as RenderStats
 from jvr.rendering.image import render as render
+from jvr.rendering.measure import Measurement as Measurement
+from jvr.rendering.measure import measure as measure
 from jvr.rendering.plan import plan as plan
 from jvr.rendering.settings import Settings as Settings
 from jvr.types import Outcome as Outcome

@@ -74,6 +74,11 @@ class Reference:
         return jax.tree.map(np.asarray, gradient)
 
 
+def to_jvr(scene: scenes.Scene) -> tuple[jvr.Scene, jvr.PerspectiveCamera]:
+    """A scene of the peers as jvr's own."""
+    return _scene(scene), _camera(scene.view)
+
+
 def _loss(entries: Any, scene: jvr.Scene, camera: jvr.PerspectiveCamera, settings: jvr.Settings) -> tuple[jax.Array, jax.Array]:
     picture = jvr.render(eqx.tree_at(ENTRIES, scene, entries), camera, settings).rgb
     return jnp.mean(jnp.square(picture - 0.5)), picture
