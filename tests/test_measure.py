@@ -1,6 +1,7 @@
 """What `jvr.measure` says of settings: errors against a finer reference, samples and times."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +11,13 @@ import jvr
 
 VOLUME = jvr.Volume(voxels(), OBLIQUE)
 SCENE = jvr.Scene(VOLUME, lut_transfer(scale=0.3), background=(0.1, 0.2, 0.3))
+ENTRIES: Any = lambda scene: (scene.transfer.rgb, scene.transfer.sigma_t)
 CAMERA = perspective(VOLUME, 12, 10)
 
 
 def test_finer_steps_cost_more_samples_and_err_less():
     settings = [jvr.Settings(step, termination=0.0) for step in (2.0, 0.5, 0.125)]
-    found = jvr.measure(SCENE, CAMERA, settings, repeats=1, unknowns=lambda s: (s.transfer.rgb, s.transfer.sigma_t))
+    found = jvr.measure(SCENE, CAMERA, settings, repeats=1, unknowns=ENTRIES)
     assert [m.settings for m in found] == settings
     for coarse, fine in itertools.pairwise(found):
         assert fine.samples > 3 * coarse.samples
