@@ -31,7 +31,7 @@ def forward() -> dict[str, Any]:
     camera = scenes.camera(volume, SIZE)
     rays, _ = jax.jit(lambda: enter(scene, *camera.rays(jnp.arange(SIZE * SIZE, dtype=jnp.int32))))()
     dt = step_length(scene, settings)
-    ours = jax.jit(lambda scene, rays, dt: march(MarchOptions(0.0, False), medium(scene), rays, dt))
+    ours = jax.jit(lambda scene, rays, dt: march(MarchOptions(0.0, False), medium(scene, settings), rays, dt))
     gathered = ours(scene, rays, dt)
     segments = int(gathered.steps.max())
     plain = jax.jit(lambda volume, transfer, rays, dt: yardsticks.vmapped_march(volume, transfer, rays, dt, segments))
@@ -48,8 +48,9 @@ def forward() -> dict[str, Any]:
 
 
 def gradient() -> dict[str, Any]:
-    """Image and gradient of a scalar loss over the image alone: opaque scene, 64-entry transfer function, and all voxels."""
-    volume, settings = scenes.gyroid(), jvr.Settings(0.5)
+    """Image and gradient of a scalar loss over the image alone: opaque scene, 64-entry transfer function, and all voxels. Nothing is
+    skipped: gradients in a transfer function may not, and an image that does would be no measure of them."""
+    volume, settings = scenes.gyroid(), jvr.Settings(0.5, skipping=False)
     scene, camera = jvr.Scene(volume, scenes.opaque()), scenes.camera(volume, SIZE)
     image = jax.jit(lambda scene: jvr.render(scene, camera, settings))
     into_entries = lambda s: (s.transfer.rgb, s.transfer.sigma_t)

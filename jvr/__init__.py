@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 from jvr.march.differentiation import Forward as Forward
 from jvr.march.differentiation import Replay as Replay
 from jvr.march.differentiation import Rows as Rows
+from jvr.march.quadrature import Midpoint as Midpoint
+from jvr.march.quadrature import PreIntegrated as PreIntegrated
 from jvr.model import presets as presets
 from jvr.model.camera import OrthographicCamera as OrthographicCamera
 from jvr.model.camera import PerspectiveCamera as PerspectiveCamera

@@ -54,10 +54,10 @@ def picture(p, settings, parallel=False, optical=jvr.EmissionAbsorption()):
     return jvr.render(scene, camera, settings)
 
 
-def make_loss(fixed, adjoint, tile=100, **options):
+def make_loss(fixed, adjoint, tile=100, quadrature=jvr.Midpoint(), **options):
     """The loss as a function of some parameters, the others being `fixed`: it touches every pixel of colour, opacity and depth,
     each with its own weight."""
-    settings = jvr.Settings(0.7, termination=0, adjoint=adjoint, tile=tile)
+    settings = jvr.Settings(0.7, termination=0, adjoint=adjoint, tile=tile, quadrature=quadrature)
 
     def loss(p):
         image = picture(fixed | p, settings, **options)
@@ -115,6 +115,11 @@ def test_optical_models(optical, x64):
     p = parameters(TRANSFERS["table, coloured"]())
     names = ("transfer", "eye") if isinstance(optical, jvr.EmissionOnly) else ("voxels", "eye")
     check_every_way(p, names, rows=(), optical=optical)
+
+
+@pytest.mark.parametrize(("kind", "parts"), [("linear", 1), ("table, coloured", 2)])
+def test_pre_integrated_segments(kind, parts, x64):
+    check_every_way(parameters(TRANSFERS[kind]()), ("transfer", "voxels", "eye"), rows=(), quadrature=jvr.PreIntegrated(parts))
 
 
 def test_entry_and_exit_through_a_clipping_box(x64):

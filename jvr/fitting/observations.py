@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jvr.march.fields import KeptField
+from jvr.march.fields import KeptField, VoxelField
 from jvr.march.march import Medium
+from jvr.march.quadrature import Midpoint
 from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
@@ -88,7 +89,12 @@ def observe(
     settings: Settings,
     chunk: int,
 ) -> Observations:
-    """All pixels of all images as observations, sorted by the length of their rays and filled up to whole chunks."""
+    """All pixels of all images as observations, sorted by the length of their rays and filled up to whole chunks.
+
+    **Raises** `ValueError` for settings that fits do not support.
+    """
+    if not isinstance(settings.quadrature, Midpoint):
+        raise ValueError("a fit resamples the midpoints of segments: leave Settings(quadrature=...) at jvr.Midpoint()")
     rays = [camera.rays(jnp.arange(camera.width * camera.height, dtype=jnp.int32)) for camera in cameras]
     origin, direction = jax.tree.map(lambda *parts: np.concatenate(parts), *rays)
     target = np.concatenate([image.reshape(-1, 3) for image in images])
@@ -142,7 +148,7 @@ def keep_samples(
 def observed_medium(scene: Scene, piece: Observations, samples: Samples | None) -> tuple[Medium, Rays]:
     """What the rays of a piece march through, resampled anew or from kept samples, and the rays inside of it."""
     rays, _ = enter(scene, piece.origin, piece.direction)
-    through = medium(scene)
+    through = medium(scene, Settings())
     if samples is not None:
         through = through._replace(field=KeptField(samples.stored, piece.start, samples.low, samples.scale, samples.stride))
     return through, rays
@@ -159,7 +165,7 @@ def _resample(scene: Scene, piece: Observations, settings: Settings, k: Int[Arra
     rays, _ = enter(scene, piece.origin, piece.direction)
     dt = step_length(scene, settings)
     _, u = segment(k, segment_count(rays.length, dt), rays.length, dt)
-    s = jax.vmap(medium(scene).field.resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
+    s = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
     return jnp.clip(jnp.round((s - low) / scale), 0, 65535).astype(jnp.uint16)
 
 

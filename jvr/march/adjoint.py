@@ -33,6 +33,7 @@ from jvr.march.march import (
     march,
     marched,
     opacity,
+    places,
     through,
     transmittance,
 )
@@ -99,8 +100,10 @@ class BackLanes(NamedTuple):
         if medium.occupancy is None:
             return j
         rays = self.lanes.rays
-        _, u = segment(jnp.maximum(self.steps - 1 - j, 0), self.lanes.segments, rays.length, dt)
-        return jnp.minimum(j + medium.occupancy.leap(rays, u, dt, backwards=True), self.steps)
+        extent, u = segment(jnp.maximum(self.steps - 1 - j, 0), self.lanes.segments, rays.length, dt)
+        within = len(medium.shader.places) > 1
+        first = u + extent / 2 if within else u
+        return jnp.minimum(j + medium.occupancy.leap(rays, first, dt, backwards=True, within=within), self.steps)
 
     def nothing_behind(self, emits: int, *, distance: bool) -> Behind:
         """What the last segment has behind it."""
@@ -195,27 +198,32 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marc
     small_mask = is_there((total.medium.transfer, total.medium.shader, state.gradient, total.dt))
     small, rest = eqx.partition((medium.transfer, medium.shader, lanes.rays, dt), small_mask)
 
-    def local(small: Any, tap: Array):
-        """The segment as a function of what its derivative is wanted for; the tap stands for the field."""
+    def local(small: Any, taps: tuple[Array, ...]):
+        """The segment as a function of what its derivative is wanted for; the taps stand for the field."""
         transfer, shader, rays, dt = eqx.combine(small, rest)
         extent, u = segment(k, count, rays.length, dt)
-        points = points_at(rays, lanes.ray, k, u)
-        classified = jax.vmap(transfer.evaluate)(jax.vmap(medium.field.resample)(points) + tap)
-        return (*jax.vmap(shader.segment)(classified, points, extent), u), points
+        sampled = places(medium, rays, lanes.ray, k, u, extent)
+        scalars = tuple(jax.vmap(medium.field.resample)(points) + tap for points, tap in zip(sampled, taps, strict=True))
+        point = points_at(rays, lanes.ray, k, u)
+        return (*jax.vmap(shader.look, in_axes=(None, 0, 0, 0))(transfer, scalars, point, extent), u), sampled
 
-    (emitted, dtau, u), pull, points = jax.vjp(local, small, jnp.zeros_like(lanes.rays.length), has_aux=True)
+    taps = (jnp.zeros_like(lanes.rays.length),) * len(medium.shader.places)
+    (emitted, dtau, u), pull, sampled = jax.vjp(local, small, taps, has_aux=True)
 
     front = back.depth(state.j, state.behind, dtau)
     before = transmittance(*front)
-    small_gradient, s_cotangent = pull(segment_cotangents(cotangent, state.behind, before, dtau, u))
+    small_gradient, cotangents = pull(segment_cotangents(cotangent, state.behind, before, dtau, u))
 
     transfer, shader, ray_gradient, dt_gradient = jax.tree.map(
         jnp.add, (total.medium.transfer, total.medium.shader, state.gradient, total.dt), small_gradient
     )
     # Always true; a conditional is the one thing that the compiler does not fuse through. Without it the whole computation of the
     # cotangent is repeated in each of the scattered additions, which then take three times as long.
-    s_cotangent = jax.lax.cond(jnp.any(state.j < back.steps), lambda x: x, jnp.zeros_like, s_cotangent)
-    field = medium.field.deposit(total.medium.field, points, s_cotangent)
+    none = lambda x: jax.tree.map(jnp.zeros_like, x)
+    cotangents = jax.lax.cond(jnp.any(state.j < back.steps), lambda x: x, none, cotangents)
+    field = total.medium.field
+    for points, of_scalar in zip(sampled, cotangents, strict=True):
+        field = medium.field.deposit(field, points, of_scalar)
     behind = step_back(state.behind, front, emitted, dtau, u)
     state = _ReplayState(behind, state.j + (state.j < back.steps), ray_gradient)
     return state, _Gradients(Medium(field, transfer, shader, total.medium.occupancy), dt_gradient)

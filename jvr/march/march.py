@@ -8,7 +8,7 @@ import abc
 import dataclasses
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jvr.march.batch import pooled_while
 from jvr.march.occupancy import Occupancy
 from jvr.march.steps import Point, Rays, points_at, segment, segment_count
-from jvr.model.transfer import AbstractTransfer, Classified
+from jvr.model.transfer import Classified
 from jvr.numerics import one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
@@ -37,18 +37,27 @@ class AbstractField(eqx.Module):
 
 
 class AbstractShader(eqx.Module):
-    """What a classified sample looks like: everything between the transfer function and the eye. Its arrays are small."""
+    """What a segment looks like: everything between the scalar and the eye. Its arrays are small."""
+
+    # Where in a segment the field is resampled, from -1/2 at its front to 1/2 at its back.
+    places: ClassVar[tuple[float, ...]] = (0.0,)
 
     @abc.abstractmethod
     def segment(self, medium: Classified, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        """Emitted radiance (three components or none) and optical depth (one, three or none) of one segment of length `dt`."""
+        """Emitted radiance (three components or none) and optical depth (one, three or none) of one segment of length `dt` whose
+        properties are constant."""
+
+    def look(self, transfer: Any, scalars: tuple[Scalar, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        """The same for a segment around `point`, from the scalars at `places`."""
+        (s,) = scalars
+        return self.segment(transfer.evaluate(s), point, dt)
 
 
 class Medium(NamedTuple):
     """What rays march through: resampled, classified, shaded; where `occupancy` is not `None`, only in visible bricks."""
 
     field: AbstractField
-    transfer: AbstractTransfer
+    transfer: Any  # what `shader.look` reads: an AbstractTransfer, or one prepared for the shader
     shader: AbstractShader
     occupancy: Occupancy | None = None
 
@@ -162,20 +171,34 @@ def marched(progress: Progress) -> Marched:
 
 
 def leap(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"]) -> Int[Array, "rays"]:
-    """The next segment, from `k` on, whose midpoint may lie in a visible brick, or the number of segments."""
+    """The next segment, from `k` on, that may have a sample in a visible brick, or the number of segments."""
     if medium.occupancy is None:
         return k
-    _, u = segment(k, lanes.segments, lanes.rays.length, dt)
-    return jnp.minimum(k + medium.occupancy.leap(lanes.rays, u, dt), lanes.segments)
+    extent, u = segment(k, lanes.segments, lanes.rays.length, dt)
+    within = len(medium.shader.places) > 1
+    first = u - extent / 2 if within else u
+    return jnp.minimum(k + medium.occupancy.leap(lanes.rays, first, dt, within=within), lanes.segments)
 
 
 def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
     """Emission and optical depth of segment `k` of every ray, and the distance of its midpoint; zero beyond `count`."""
     extent, u = segment(k, count, lanes.rays.length, dt)
-    points = points_at(lanes.rays, lanes.ray, k, u)
-    classified = jax.vmap(medium.transfer.evaluate)(jax.vmap(medium.field.resample)(points))
-    emitted, dtau = jax.vmap(medium.shader.segment)(classified, points, extent)
+    scalars = tuple(jax.vmap(medium.field.resample)(points) for points in places(medium, lanes.rays, lanes.ray, k, u, extent))
+    point = points_at(lanes.rays, lanes.ray, k, u)
+    emitted, dtau = jax.vmap(medium.shader.look, in_axes=(None, 0, 0, 0))(medium.transfer, scalars, point, extent)
     return emitted, dtau, u
+
+
+def places(
+    medium: Medium,
+    rays: Rays,
+    ray: Int[Array, "rays"],
+    k: Int[Array, "..."],
+    u: Float[Array, "rays"],
+    extent: Float[Array, "rays"],
+) -> list[Point]:
+    """Where a segment around `u` is resampled."""
+    return [points_at(rays, ray, k, u + at * extent if at else u) for at in medium.shader.places]
 
 
 def add_segment(sums: Sums, emitted: Channels, dtau: Channels, u: Float[Array, "rays"]) -> Sums:
@@ -229,8 +252,8 @@ def opaque_depth(dtype: Any) -> float:
 def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:
     """How many channels the medium emits and absorbs in, by shape alone."""
     point = Point(tuple(x[0] for x in rays.entry), jnp.int32(0), jnp.int32(0))
-    classified = jax.eval_shape(medium.transfer.evaluate, dt)
-    emitted, dtau = jax.eval_shape(medium.shader.segment, classified, point, dt)
+    scalars = (dt,) * len(medium.shader.places)
+    emitted, dtau = jax.eval_shape(medium.shader.look, medium.transfer, scalars, point, dt)
     return len(emitted), len(dtau)
 
 

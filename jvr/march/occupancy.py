@@ -28,10 +28,13 @@ class Occupancy(eqx.Module):
     reach: UInt8[Array, "bx by bz"]
     size: int = eqx.field(static=True)
 
-    def leap(self, rays: Rays, u: Float[Array, "rays"], dt: Scalar, *, backwards: bool = False) -> Int[Array, "rays"]:
-        """How many samples to go on from the one at distance `u`: 0 where it may be visible itself.
+    def leap(
+        self, rays: Rays, u: Float[Array, "rays"], dt: Scalar, *, backwards: bool = False, within: bool = False
+    ) -> Int[Array, "rays"]:
+        """How many segments of length `dt` to go on from distance `u`: 0 where it may be visible itself.
 
-        No sample between here and there is in a visible brick; where rounding leaves a doubt, the leap is one sample shorter.
+        With midpoints at `u, u + dt, ...` none of those passed over is in a visible brick. With `within`, segments begin at `u`, and
+        no point of those passed over is. Where rounding leaves a doubt, the leap is one segment shorter.
         """
         shape, sign = self.reach.shape, -1.0 if backwards else 1.0
         p = [e + u * d for e, d in zip(rays.entry, rays.direction, strict=True)]
@@ -43,7 +46,8 @@ class Occupancy(eqx.Module):
             d = sign * d
             face = jnp.where(d > 0, brick + reach, brick + 1 - reach) * self.size
             distance = jnp.where(d == 0, distance, jnp.minimum(distance, (face - x) / jnp.where(d == 0, 1.0, d)))
-        steps = jnp.clip(jnp.ceil(distance / dt - 1e-3), 1, 2**30).astype(jnp.int32)
+        steps = jnp.floor(distance / dt - 1e-3) if within else jnp.maximum(jnp.ceil(distance / dt - 1e-3), 1.0)
+        steps = jnp.clip(steps, 0, 2**30).astype(jnp.int32)
         return jnp.where(reach > 0, steps, 0)
 
 

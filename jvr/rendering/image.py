@@ -69,7 +69,7 @@ def trace(
     scene, camera = one_precision(scene, camera)
     rays, t_in = enter(scene, *camera.rays(pixels))
     options = MarchOptions(settings.termination, distance)
-    return settings.adjoint.march(options, medium(scene, where), rays, step_length(scene, settings)), rays, t_in
+    return settings.adjoint.march(options, medium(scene, settings, where), rays, step_length(scene, settings)), rays, t_in
 
 
 def one_precision(scene: Scene, camera: AbstractCamera) -> tuple[Scene, AbstractCamera]:

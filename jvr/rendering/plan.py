@@ -1,15 +1,19 @@
 """What of a scene is in the compiled program, decided from its structure alone."""
 
 import dataclasses
+from typing import Any, ClassVar, cast
 
 import jax
+from jax.core import Tracer
 
 from jvr.march.fields import VoxelField
 from jvr.march.march import AbstractShader, Medium
 from jvr.march.occupancy import Occupancy, occupancy_of
+from jvr.march.quadrature import PreIntegrated
 from jvr.march.steps import Point
 from jvr.model.bricks import bricks_of
 from jvr.model.optical import AbstractOpticalModel, EmissionOnly
+from jvr.model.preintegration import PreIntegratedTable
 from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
 from jvr.model.volume import Volume
@@ -26,9 +30,23 @@ class OpticalShader(AbstractShader):
         return self.optical.segment(medium, dt)
 
 
-def medium(scene: Scene, occupancy: Occupancy | None = None) -> Medium:
+class PreIntegratedShader(OpticalShader):
+    """The optical model alone, the scalar linear along a segment."""
+
+    places: ClassVar[tuple[float, ...]] = (-0.5, 0.5)
+
+    def look(self, transfer: Any, scalars: tuple[Scalar, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        return transfer.segment(self.optical, *scalars, dt)
+
+
+def medium(scene: Scene, settings: Settings, occupancy: Occupancy | None = None) -> Medium:
     """What of a scene rays march through."""
-    return Medium(VoxelField(scene.volume), scene.transfer, OpticalShader(scene.optical), occupancy)
+    field = VoxelField(scene.volume)
+    if isinstance(settings.quadrature, PreIntegrated):
+        # Checks the transfer function's type itself.
+        table = PreIntegratedTable(cast(Any, scene.transfer), settings.quadrature.parts)
+        return Medium(field, table, PreIntegratedShader(scene.optical), occupancy)
+    return Medium(field, scene.transfer, OpticalShader(scene.optical), occupancy)
 
 
 def occupancy(scene: Scene, settings: Settings) -> Occupancy | None:
@@ -36,7 +54,14 @@ def occupancy(scene: Scene, settings: Settings) -> Occupancy | None:
     if not settings.skipping:
         return None
     volume = scene.volume
-    bricks = bricks_of(jax.lax.stop_gradient(volume.values)) if volume.bricks is None else volume.bricks
+    bricks = volume.bricks
+    if bricks is None and isinstance(volume.values, Tracer):
+        bricks = bricks_of(jax.lax.stop_gradient(volume.values))
+    elif bricks is None:
+        # Voxels that a traced function closes over are constants; the compiler would fold all of this, and takes seconds for it.
+        with jax.ensure_compile_time_eval():
+            bricks = volume.bricked().bricks
+    assert bricks is not None
     return occupancy_of(bricks, volume.slope, volume.intercept, scene.transfer)
 
 
@@ -78,9 +103,11 @@ def plan(scene: Scene, settings: Settings = Settings()) -> Plan:
     coloured = any(getattr(transfer, name, transfer.rgb).ndim == 2 for name in ("sigma_t", "height") if hasattr(transfer, name))
     transparent = isinstance(scene.optical, EmissionOnly)
     termination = f"rays end at transmittance {settings.termination:g}" if settings.termination > 0 else "rays run to their end"
+    quadrature = settings.quadrature
     parts = (
         Part("volume", True, f"{voxels}, {type(volume.interpolation).__name__.lower()}, a sample every {settings.step:g} voxels"),
         Part("transfer", True, f"{type(transfer).__name__}, {'coloured' if coloured else 'grey'} extinction"),
+        Part("pre-integration", isinstance(quadrature, PreIntegrated), quadrature.explanation),
         Part("optical model", True, type(scene.optical).__name__),
         Part("empty-space skipping", settings.skipping, _skipping(volume) if settings.skipping else "every sample is taken"),
         Part(

@@ -5,6 +5,7 @@ import math
 import equinox as eqx
 
 from jvr.march.differentiation import AbstractAdjoint, Replay
+from jvr.march.quadrature import AbstractQuadrature, Midpoint
 
 
 class Settings(eqx.Module):
@@ -15,6 +16,7 @@ class Settings(eqx.Module):
     - `step`: length of a segment in units of the smallest voxel spacing; the error falls with its square in smooth scenes.
     - `termination`: a ray ends once its transmittance is at most this, in every channel. What is behind could have added at most
       `termination` times the brightest radiance. 0 follows every ray to its end.
+    - `quadrature`: how a segment is integrated: `jvr.Midpoint()` (default) or `jvr.PreIntegrated()`.
     - `skipping`: whether rays leap over bricks of the volume that the transfer function leaves empty. The picture is the same to
       rounding; what gradients skip is what has none.
     - `adjoint`: how derivatives are computed: `jvr.Replay()` (reverse mode, default), `jvr.Forward()` or `jvr.Rows()`.
@@ -25,6 +27,7 @@ class Settings(eqx.Module):
 
     step: float = eqx.field(static=True)
     termination: float = eqx.field(static=True)
+    quadrature: AbstractQuadrature
     skipping: bool = eqx.field(static=True)
     adjoint: AbstractAdjoint
     tile: int = eqx.field(static=True)
@@ -34,6 +37,7 @@ class Settings(eqx.Module):
         step: float | int = 0.5,
         *,
         termination: float | int = 1e-4,
+        quadrature: AbstractQuadrature = Midpoint(),
         skipping: bool = True,
         adjoint: AbstractAdjoint = Replay(),
         tile: int = 262_144,
@@ -42,6 +46,8 @@ class Settings(eqx.Module):
             raise ValueError(f"step must be a positive number of voxels, not {step!r}; 0.5 is a good start")
         if not isinstance(termination, int | float) or not 0 <= termination < 1:
             raise ValueError(f"termination must be a transmittance in [0, 1), not {termination!r}; 0 never ends a ray early")
+        if not isinstance(quadrature, AbstractQuadrature):
+            raise TypeError(f"quadrature must be jvr.Midpoint() or jvr.PreIntegrated(), not {quadrature!r}")
         if not isinstance(skipping, bool):
             raise TypeError(f"skipping must be True or False, not {skipping!r}")
         if isinstance(tile, bool) or not isinstance(tile, int) or tile < 1:
@@ -50,6 +56,7 @@ class Settings(eqx.Module):
             raise TypeError(f"adjoint must be jvr.Replay(), jvr.Forward() or jvr.Rows(), not {adjoint!r}")
         self.step = float(step)
         self.termination = float(termination)
+        self.quadrature = quadrature
         self.skipping = skipping
         self.adjoint = adjoint
         self.tile = tile
