@@ -212,6 +212,11 @@ def test_scaling_maps_a_range_to_the_unit_interval():
     np.testing.assert_allclose(volume.values, np.clip((np.asarray(before.values) - 0.2) / 0.4, 0, 1), atol=1e-6)
 
 
+def test_settings_become_objects():
+    made = build_settings(config(BASE, "settings.quadrature=pre-integrated", "settings.skipping=false", "settings.step=2"))
+    assert made == jvr.Settings(2.0, quadrature=jvr.PreIntegrated(), skipping=False)
+
+
 def test_names_become_objects():
     made = config(
         BASE + "[truth]\nkind = 'window'\n[fit]\n",

@@ -18,6 +18,7 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
     with reading():
         scene, settings = build_scene(config), build_settings(config)
         cameras = build_cameras(config, scene.volume)
+    import equinox as eqx
     import jax
 
     from jvr.io.images import write_image
@@ -25,6 +26,8 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
 
     pictures, outputs, compile_seconds = [], _names(output, len(cameras)), 0.0
     program = jax.jit(render)
+    if settings.skipping:
+        scene = eqx.tree_at(lambda s: s.volume, scene, scene.volume.bricked())
     with progress("rendering"):
         for i, camera in enumerate(cameras):
             start = time.perf_counter()

@@ -24,6 +24,7 @@ from jvr.io.config.schema import (
 )
 from jvr.io.config.transfers import build_transfer, read_transfer
 from jvr.march.differentiation import Forward, Replay, Rows
+from jvr.march.quadrature import Midpoint, PreIntegrated
 from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, fibonacci_sphere, look_at, orbit
 from jvr.model.optical import AbsorptionOnly, EmissionAbsorption, EmissionOnly
 from jvr.model.scene import Scene
@@ -32,6 +33,7 @@ from jvr.model.volume import ClippingBox, Nearest, Trilinear, Volume
 from jvr.rendering.image import render
 from jvr.rendering.settings import Settings
 
+QUADRATURES = {"midpoint": Midpoint, "pre-integrated": PreIntegrated}
 ADJOINTS = {"replay": Replay, "forward": Forward, "rows": Rows}
 INTERPOLATIONS = {"trilinear": Trilinear, "nearest": Nearest}
 OPTICAL = {"emission-absorption": EmissionAbsorption, "emission-only": EmissionOnly, "absorption-only": AbsorptionOnly}
@@ -63,7 +65,14 @@ def build_settings(config: Config) -> Settings:
     """`jvr.Settings` of `[settings]`."""
     table = config.tables.settings
     with blame(config.name, "settings"):
-        return Settings(table.step, termination=table.termination, adjoint=ADJOINTS[table.adjoint](), tile=table.tile)
+        return Settings(
+            table.step,
+            termination=table.termination,
+            quadrature=QUADRATURES[table.quadrature](),
+            skipping=table.skipping,
+            adjoint=ADJOINTS[table.adjoint](),
+            tile=table.tile,
+        )
 
 
 def build_volume(config: Config) -> Volume:

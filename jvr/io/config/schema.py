@@ -252,6 +252,8 @@ class SettingsTable(Table):
 
     step: Annotated[float, number("length of a step in voxels of the smallest spacing", 0.0, inner=True)] = 0.5
     termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", 0.0, 0.999)] = 1e-4
+    quadrature: Literal["midpoint", "pre-integrated"] = "midpoint"
+    skipping: bool = True
     tile: Annotated[int, whole("rays at a time", 1)] = 262_144
     adjoint: Literal["replay", "forward", "rows"] = "replay"
 
