@@ -1,6 +1,7 @@
 """One segment through a piecewise-linear table, the scalar linear between its ends, against quadrature in float64."""
 
 import contextlib
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -76,12 +77,11 @@ def segment(table, s0, s1, dt, parts=1):
     return jnp.stack([*emitted, *dtau])
 
 
-def _values_and_rows(table, s0, s1, dt):
-    values = jax.vmap(segment, (None, 0, 0, 0))(table, s0, s1, dt)
-    return values, jax.vmap(jax.jacrev(segment, (0, 1, 2, 3)), (None, 0, 0, 0))(table, s0, s1, dt)
-
-
-_compiled_rows = compiled(_values_and_rows)
+@compiled
+@functools.partial(jax.vmap, in_axes=(None, 0, 0, 0))
+def _compiled_rows(*arguments):
+    values, pull = jax.vjp(segment, *arguments)
+    return values, jax.vmap(pull)(jnp.eye(values.size))
 
 
 def values_and_rows(table, ends):
