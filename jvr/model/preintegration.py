@@ -93,7 +93,11 @@ class PreIntegratedTable(eqx.Module):
 
     def segment(self, optical: AbstractOpticalModel, s0: Scalar, s1: Scalar, dt: Scalar) -> tuple[Channels, Channels]:
         """Radiance that leaves a segment of length `dt` along which the scalar goes linearly from `s0` to `s1`, and its optical
-        depth, in the channels of `optical.segment`. Differentiable in everything."""
+        depth, in the channels of `optical.segment`.
+
+        Differentiable in everything. Where an end lies at an entry the derivative in the scalar is that of one side. The place of an
+        entry between those of a `LutTransfer`'s domain is known to rounding: so is which side a scalar nearer than that lies on.
+        """
         emitted, dtau = self.means(s0, s1).emit(optical, dt)
         if self.parts == 1 or not emitted or not dtau:
             return emitted, dtau
@@ -141,7 +145,11 @@ class PreIntegratedTable(eqx.Module):
         level = jnp.where(k > j, 31 - jax.lax.clz(j ^ k), 0)
         rows = [row for i in (i_a, i_b) for row in read_run(self.entries, i, 2)]
         rows += [read_run(self.blocks, level * n + i, 1)[0] for i in (j, k)]
-        below_a, above_a, below_b, above_b, *blocks = _apart(jnp.isfinite(self.entries[0, 0]), [_columns(row) for row in rows])
+        columns = [_columns(row) for row in rows]
+        if isinstance(self.table, LutTransfer):
+            # Lengths are counted in intervals there: no derivative goes through them.
+            columns = [(jax.lax.stop_gradient(length), *values) for length, *values in columns]
+        below_a, above_a, below_b, above_b, *blocks = _apart(jnp.isfinite(self.entries[0, 0]), columns)
         end_a = _End(x_a, i_a, below_a[0], above_a[0], below_a[1:], above_a[1:])
         return end_a, _End(x_b, i_b, below_b[0], above_b[0], below_b[1:], above_b[1:]), (blocks[0], blocks[1])
 
