@@ -31,6 +31,8 @@ from jvr.rendering.measure import Measurement as Measurement
 from jvr.rendering.measure import measure as measure
 from jvr.rendering.plan import plan as plan
 from jvr.rendering.settings import Settings as Settings
+from jvr.rendering.tune import Tuned as Tuned
+from jvr.rendering.tune import tune as tune
 from jvr.types import Outcome as Outcome
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from jvr.cli.inputs import BadInput, check_folder_output, check_image_output, load, reading
+from jvr.cli.inputs import BadInput, check_file_output, check_folder_output, check_image_output, load, reading
 
 HELP = "Differentiable volume rendering: pictures of scalar volumes, and transfer functions from pictures."
 app = typer.Typer(help=HELP, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
@@ -75,6 +75,41 @@ def fit(
         check_folder_output(output)
     report = fit_scene(config, output, resume=resume)
     _print(report, as_json, _summary(report, output))
+
+
+@app.command(epilog=_examples("jvr tune configs/demo.toml --error 1e-3 -o tuned.toml", "jvr tune configs/demo.toml --time 0.1"))
+def tune(
+    given: ConfigFile,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Copy of the configuration.", show_default="NAME-tuned.toml")
+    ] = None,
+    error: Annotated[
+        float | None, typer.Option(help="Root mean square error, linear radiance: find the fastest settings.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--time", help="Seconds for a picture: find the most accurate settings.")
+    ] = None,
+    sets: Set = None,
+    as_json: Json = False,
+) -> None:
+    """Find the settings that a scene needs for an error, or can have for a time, and write a configuration with them."""
+    from jvr.cli.tune import tune_settings
+
+    output = given.with_name(f"{given.stem}-tuned.toml") if output is None else output
+    with reading():
+        if (error is None) == (seconds is None):
+            raise BadInput("give either --error or --time")
+        for flag, value in (("--error", error), ("--time", seconds)):
+            if value is not None and not 0 < value < float("inf"):
+                raise BadInput(f"{flag} must be a positive number, not {value:g}")
+        config = load(given, sets or [])
+        check_file_output(output, "tuned.toml")
+    report = tune_settings(config, output, error, seconds)
+    settings, lines = report["settings"], []
+    for name in ("predicted", "measured"):
+        lines.append(f"{name + ':':<11}RMSE {report[name]['rmse']:.2e}, {1e3 * report[name]['seconds']:.0f} ms")
+    lines.append(f"step {settings['step']:g}, termination {settings['termination']:g}, {settings['quadrature']}: {output}")
+    _print(report, as_json, "\n".join(lines))
 
 
 @app.command(epilog=_examples("jvr plan configs/demo.toml", "jvr plan configs/demo.toml --set settings.termination=0 --json"))

@@ -68,8 +68,13 @@ def check_image_output(path: Path) -> None:
     """Refuses a picture that could not be written."""
     if path.suffix.lower() not in IMAGES:
         raise BadInput(f"-o {path}: pictures are written as .exr (linear) or .png (sRGB)")
+    check_file_output(path, "out.png")
+
+
+def check_file_output(path: Path, example: str) -> None:
+    """Refuses a file that could not be written."""
     if path.is_dir():
-        raise BadInput(f"-o {path}: this is a folder; name a file in it, such as {path / 'out.png'}")
+        raise BadInput(f"-o {path}: this is a folder; name a file in it, such as {path / example}")
     if path.exists() and not os.access(path, os.W_OK):
         raise BadInput(f"-o {path}: the file is write-protected; choose another name")
     _try_to_write(path.parent, f"-o {path}")

@@ -1,6 +1,7 @@
 """What accuracy costs in time: pictures and gradients under several settings, against a reference."""
 
 import dataclasses
+import functools
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -26,9 +27,9 @@ class Measurement:
     """What one setting costs and how far its picture is from the reference, in linear radiance.
 
     `seconds`: median time of a picture (of picture and gradient, where a gradient was asked for), compilation apart
-    (`compile_seconds`); `samples`: segments sampled for the picture; `rmse`, `largest`: root mean square and largest difference over
-    pixels and channels; `ssim`: structural similarity (1 is identical); `gradient_error`: norm of the difference of the gradients
-    over the norm of the reference's, or `None`.
+    (`compile_seconds`, about 0 where it was compiled already); `samples`: segments sampled for the picture; `rmse`, `largest`: root
+    mean square and largest difference over pixels and channels; `ssim`: structural similarity (1 is identical); `gradient_error`:
+    norm of the difference of the gradients over the norm of the reference's, or `None`.
     """
 
     settings: Settings
@@ -77,6 +78,7 @@ def measure(
     return tuple(_compare(truth, s, median, once - median, image) for s, median, once, image in rows)
 
 
+@functools.lru_cache(maxsize=32)
 def _program(settings: Settings, unknowns: Callable[[Scene], Any] | None) -> Callable[..., Any]:
     """Picture, number of samples and gradient (or `None`) as a compiled function of scene and camera."""
 
