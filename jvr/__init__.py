@@ -27,12 +27,8 @@ from jvr.model.volume import Volume as Volume
 from jvr.rendering.image import Rendering as Rendering
 from jvr.rendering.image import RenderStats as RenderStats
 from jvr.rendering.image import render as render
-from jvr.rendering.measure import Measurement as Measurement
-from jvr.rendering.measure import measure as measure
 from jvr.rendering.plan import plan as plan
 from jvr.rendering.settings import Settings as Settings
-from jvr.rendering.tune import Tuned as Tuned
-from jvr.rendering.tune import tune as tune
 from jvr.types import Outcome as Outcome
 
 if TYPE_CHECKING:
@@ -57,6 +53,10 @@ if TYPE_CHECKING:
     from jvr.fitting.unknowns import Sigmoid as Sigmoid
     from jvr.fitting.unknowns import Softplus as Softplus
     from jvr.io.volumes import read_volume as read_volume
+    from jvr.rendering.measure import Measurement as Measurement
+    from jvr.rendering.measure import measure as measure
+    from jvr.rendering.tune import Tuned as Tuned
+    from jvr.rendering.tune import tune as tune
 
 __version__ = "0.1.0"
 
@@ -77,6 +77,8 @@ _LATE = {
     "jvr.fitting.solvers": ("LBFGSB", "Dogleg", "GaussNewton", "LevenbergMarquardt"),
     "jvr.fitting.unknowns": ("Identity", "Ordered", "Sigmoid", "Softplus"),
     "jvr.io.volumes": ("read_volume",),
+    "jvr.rendering.measure": ("Measurement", "measure"),
+    "jvr.rendering.tune": ("Tuned", "tune"),
 }
 _MODULE_OF = {name: module for module, names in _LATE.items() for name in names}
 

@@ -47,6 +47,7 @@ def test_inline_settings_are_refused():
         with_settings("settings = { step = 1.0 }", CHOSEN)
 
 
+@pytest.mark.slow
 def test_cheapest_that_meets_an_error():
     """It does on the smaller picture, and on the whole one."""
     found = tune.tune(SCENE, CAMERA, error=5e-3)

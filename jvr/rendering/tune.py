@@ -7,7 +7,7 @@ from jvr.march.quadrature import Midpoint, PreIntegrated
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import LinearTransfer, LutTransfer
-from jvr.rendering.measure import Measurement, measure
+from jvr.rendering.measure import FINER, Measurement, measure
 from jvr.rendering.settings import Settings
 
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
@@ -46,12 +46,18 @@ def tune(scene: Scene, camera: AbstractCamera, *, error: float | None = None, se
         dataclasses.replace(m, seconds=m.seconds * pixels) for m in measure(scene, small, _candidates(scene, error), repeats=3)
     )
     asked = (lambda m: m.rmse <= error) if error is not None else (lambda m: m.seconds <= seconds)
-    order = _order(found, asked, error)
-    for predicted in order:
-        (measured,) = measure(scene, camera, [predicted.settings], reference_step=min(STEPS) / 4, repeats=3)
+    *tries, safest = _order(found, asked, error)
+    for predicted in tries:
+        measured = _whole(scene, camera, predicted)
         if asked(measured):
-            break
-    return Tuned(predicted.settings, predicted, measured, asked(measured), found)
+            return Tuned(predicted.settings, predicted, measured, True, found)
+    measured = _whole(scene, camera, safest)
+    return Tuned(safest.settings, safest, measured, asked(measured), found)
+
+
+def _whole(scene: Scene, camera: AbstractCamera, predicted: Measurement) -> Measurement:
+    (measured,) = measure(scene, camera, [predicted.settings], reference_step=min(STEPS) / FINER, repeats=3)
+    return measured
 
 
 def _candidates(scene: Scene, error: float | None) -> list[Settings]:
