@@ -213,6 +213,7 @@ def test_memory_of_a_gradient_does_not_grow_with_the_steps():
     assert max(of_voxels, of_transfer) <= 300 * size * size + 2 * volume.values.nbytes
 
 
+@pytest.mark.slow
 def test_parts_of_different_precision(x64):
     """With x64 on, a single-precision part of a scene keeps the others' digits and gets a gradient in its own."""
     scene, camera = jvr.Scene(jvr.Volume(voxels(), OBLIQUE), linear_transfer()), perspective(jvr.Volume(voxels(), OBLIQUE))
