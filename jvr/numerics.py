@@ -1,10 +1,14 @@
 """Functions with a delicate limit, and their derivatives; reads and writes that the compiler does well."""
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jvr.types import Corner, Triple
+
+Tree = TypeVar("Tree")
 
 
 def two_sum(
@@ -85,6 +89,15 @@ def ray_box(origin: Triple, direction: Triple, lower: Corner, upper: Corner) -> 
         leave = jnp.where(parallel, jnp.where(inside, jnp.inf, -jnp.inf), jnp.maximum(first, second))
         t_near, t_far = jnp.maximum(t_near, enter), jnp.minimum(t_far, leave)
     return t_near, t_far
+
+
+def computed_once(proof: Bool[Array, "..."], x: Tree) -> Tree:
+    """`x` itself, which the CPU compiler then computes once and not again in each kernel that reads it.
+
+    A conditional is the one thing that it does not fuse through (an optimization barrier does not survive it). `proof` has
+    an element that is true whenever `x` matters, which the compiler cannot know; where none is, zeros are returned.
+    """
+    return jax.lax.cond(jnp.any(proof), lambda x: x, lambda x: jax.tree.map(jnp.zeros_like, x), x)
 
 
 def read_run(array: Shaped[Array, "n *row"], start: Int[Array, ""], length: int) -> Shaped[Array, "length *row"]:

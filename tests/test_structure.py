@@ -14,7 +14,7 @@ import jvr
 
 PACKAGE = Path(jvr.__file__).parent
 # A module imports from modules before it.
-ORDER = ("types", "numerics", "model", "march", "effects", "rendering", "fitting", "io", "report", "cli")
+ORDER = ("types", "numerics", "parallel", "model", "march", "effects", "rendering", "fitting", "io", "report", "cli")
 HEAVY = (
     "optimistix",
     "jaxopt",

@@ -83,12 +83,9 @@ def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float)
 
 def _pictures(scene: Any, exposure: float, cameras: Any, job: FitJob) -> list[np.ndarray]:
     """What a scene looks like from each camera, in the radiance of the target images."""
-    import jax
-
     from jvr.rendering.image import render
 
-    program = jax.jit(render)
-    return [exposure * np.asarray(program(scene, camera, job.keywords["settings"]).rgb) for camera in cameras]
+    return [exposure * np.asarray(render(scene, camera, job.keywords["settings"]).rgb) for camera in cameras]
 
 
 def _write_views(folder: Path, name: str, target: np.ndarray, fitted: np.ndarray) -> None:

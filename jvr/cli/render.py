@@ -21,21 +21,21 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
     import equinox as eqx
     import jax
 
+    from jvr.cli.runtime import compiling
     from jvr.io.images import write_image
     from jvr.rendering.image import render
 
     pictures, outputs, compile_seconds = [], _names(output, len(cameras)), 0.0
-    program = jax.jit(render)
     if settings.skipping:
         scene = eqx.tree_at(lambda s: s.volume, scene, scene.volume.bricked())
     with progress("rendering"):
         for i, camera in enumerate(cameras):
-            start = time.perf_counter()
-            compiled = program.lower(scene, camera, settings).compile()
-            compile_seconds += time.perf_counter() - start
-            start = time.perf_counter()
-            picture = jax.block_until_ready(compiled(scene, camera, settings))
-            pictures.append(_numbers(picture, camera, outputs[i], time.perf_counter() - start))
+            with compiling() as compiled:
+                start = time.perf_counter()
+                picture = jax.block_until_ready(render(scene, camera, settings))
+                seconds = time.perf_counter() - start
+            compile_seconds += compiled[0]
+            pictures.append(_numbers(picture, camera, outputs[i], seconds - compiled[0]))
             # With a background the colours are no longer those of the medium alone, which is what alpha belongs to.
             alpha = np.asarray(picture.alpha) if scene.background is None else None
             depth = {"depth": np.asarray(picture.depth)} if outputs[i].suffix.lower() == ".exr" else {}

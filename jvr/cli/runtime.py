@@ -39,6 +39,24 @@ def progress(message: str) -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def compiling() -> Iterator[list[float]]:
+    """The seconds that were spent compiling meanwhile, as the one element of a list; in several threads at once, all of theirs."""
+    from jax import monitoring
+
+    spent = [0.0]
+
+    def add(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            spent[0] += duration_secs
+
+    monitoring.register_event_duration_secs_listener(add)
+    try:
+        yield spent
+    finally:
+        monitoring.unregister_event_duration_listener(add)
+
+
 def provenance() -> dict[str, Any]:
     """Versions and device, for a result that someone wants to repeat."""
     import jax

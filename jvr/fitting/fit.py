@@ -268,10 +268,10 @@ def _compare(
     """PSNR and SSIM of views that took no part in the fit."""
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-    program, exposure = jax.jit(render), 1.0 if found.exposure is None else float(found.exposure)
+    exposure = 1.0 if found.exposure is None else float(found.exposure)
     scores = []
     for camera, target in zip(cameras, check_images(cameras, images, "held-out image"), strict=True):
-        rendered = exposure * np.asarray(program(found.scene, camera, settings).rgb)
+        rendered = exposure * np.asarray(render(found.scene, camera, settings).rgb)
         psnr = peak_signal_noise_ratio(target, rendered, data_range=1.0)
         # An odd window that fits into the smallest picture.
         window = min(7, (min(target.shape[:2]) - 1) // 2 * 2 + 1)

@@ -18,6 +18,7 @@ from jvr.fitting.observations import Observations, thin
 from jvr.fitting.solvers import Functions
 from jvr.march.differentiation import Rows
 from jvr.model.camera import AbstractCamera
+from jvr.parallel import in_threads
 from jvr.types import Scalar
 
 # The first level of a least-squares solver takes at most every so-manieth ray ...
@@ -122,7 +123,8 @@ class Work:
 
     def _sum(self, values: Float[Array, "unknowns"], observations: Observations, problem: Problem | None = None) -> Normal:
         """The normal equations of all chunks together, in float64."""
-        parts = [normal_equations(problem or self.problem, values, piece) for piece in observations.chunks(self.chunk)]
+        of_piece = functools.partial(normal_equations, problem or self.problem, values)
+        parts = in_threads(of_piece, observations.chunks(self.chunk))
         return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
 
     def _functions(self, cameras: tuple[AbstractCamera, ...], images: tuple[Array, ...]) -> Functions:

@@ -28,17 +28,17 @@ from jvr.march.march import (
     Marched,
     MarchOptions,
     Medium,
+    Noted,
     integrate,
     lanes_of,
     march,
-    marched,
     opacity,
     places,
     through,
     transmittance,
 )
 from jvr.march.steps import Rays, points_at, segment
-from jvr.numerics import one_minus_exp, two_sum
+from jvr.numerics import computed_once, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
 
@@ -51,10 +51,10 @@ def _replay_forward(options: MarchOptions, *arguments: Any):
     is_primal = lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
     inputs = jax.tree.map(lambda x: x.value, arguments, is_leaf=is_primal)
     perturbed = jax.tree.map(lambda x: x.perturbed and eqx.is_inexact_array(x.value), arguments, is_leaf=is_primal)
-    end = integrate(options, *inputs, for_replay=True)
+    gathered, noted = integrate(options, *inputs, for_replay=True)
     # What is perturbed is known by which half of the inputs a leaf is in: a None in `wanted` asks for no derivative.
     wanted, fixed = eqx.partition(inputs, perturbed)
-    return marched(end), (wanted, fixed, end._replace(sums=None, steps=None))
+    return gathered, (wanted, fixed, noted)
 
 
 def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
@@ -63,8 +63,8 @@ def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
         # Nobody asks for the derivative of the distance: it is then not replayed either.
         cotangent = cotangent._replace(distance=())
     cotangent = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_zero(x) else x, cotangent, is_leaf=is_zero)
-    wanted, fixed, end = residuals
-    return replay(wanted, fixed, end, cotangent._replace(steps=None))
+    wanted, fixed, noted = residuals
+    return replay(wanted, fixed, noted, cotangent._replace(steps=None))
 
 
 replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
@@ -84,7 +84,7 @@ class Behind(NamedTuple):
 
 class BackLanes(NamedTuple):
     """A batch of rays that are walked backwards, from segment `steps - 1` on; `front` and `last` are those of the forward march's
-    `Progress`."""
+    `Noted`."""
 
     lanes: Lanes
     steps: Int[Array, "rays"]
@@ -162,10 +162,10 @@ class _Gradients(NamedTuple):
     dt: Any
 
 
-def replay(wanted: Any, fixed: Any, end: Any, cotangent: Marched) -> Any:
+def replay(wanted: Any, fixed: Any, noted: Noted, cotangent: Marched) -> Any:
     """The gradient of `<cotangent, march>` with respect to the leaves of `wanted` that are not `None`.
 
-    **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `end`: the forward march's `Progress`.
+    **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `noted`: by the forward march.
     """
     medium, rays, dt = eqx.combine(wanted, fixed)
     if jax.tree.leaves(wanted[0].transfer):
@@ -185,9 +185,9 @@ def replay(wanted: Any, fixed: Any, end: Any, cotangent: Marched) -> Any:
     def advance(inputs: tuple[BackLanes, Marched], state: _ReplayState, total: _Gradients):
         return _replay_segment(medium, dt, *inputs, state, total)
 
-    inputs = (BackLanes(lanes_of(rays, dt), end.following, end.front, end.last), cotangent)
+    inputs = (BackLanes(lanes_of(rays, dt), *noted), cotangent)
     total = _Gradients(zeros(wanted[0]), zeros(wanted[2]))
-    gradient, total = pooled_while(alive, advance, start, lambda state: state.gradient, inputs, total, end.following)
+    gradient, total = pooled_while(alive, advance, start, lambda state: state.gradient, inputs, total, noted.following)
     return total.medium, gradient, total.dt
 
 
@@ -217,10 +217,8 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marc
     transfer, shader, ray_gradient, dt_gradient = jax.tree.map(
         jnp.add, (total.medium.transfer, total.medium.shader, state.gradient, total.dt), small_gradient
     )
-    # Always true; a conditional is the one thing that the compiler does not fuse through. Without it the whole computation of the
-    # cotangent is repeated in each of the scattered additions, which then take three times as long.
-    none = lambda x: jax.tree.map(jnp.zeros_like, x)
-    cotangents = jax.lax.cond(jnp.any(state.j < back.steps), lambda x: x, none, cotangents)
+    # Else the whole computation of the cotangent is repeated in each of the scattered additions, which then take three times as long.
+    cotangents = computed_once(state.j < back.steps, cotangents)
     field = total.medium.field
     for points, of_scalar in zip(sampled, cotangents, strict=True):
         field = medium.field.deposit(field, points, of_scalar)

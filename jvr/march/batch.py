@@ -75,8 +75,9 @@ def pooled_while(
 
     carry = (own, state, shared, index, jnp.int32(POOL), results)
     own, state, shared, index, _, results = jax.lax.while_loop(filling, drain_and_fill, carry)
-    # Lanes that are not alive are done and written; the last of them fill up the smaller pool, and are written again.
-    lanes = jnp.argsort(~alive(own, state))[:TAIL]
+    # Lanes that are not alive are done and written; one of them fills up the smaller pool, and is written again.
+    living = alive(own, state)
+    lanes = jnp.nonzero(living, size=TAIL, fill_value=jnp.argmin(living))[0]
     index, state = index[lanes], jax.tree.map(lambda x: x[lanes], state)
     own = take(index)
     state, shared = jax.lax.while_loop(lambda c: jnp.any(alive(own, c[0])), lambda c: advance(own, *c), (state, shared))

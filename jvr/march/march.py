@@ -19,7 +19,7 @@ from jvr.march.batch import pooled_while
 from jvr.march.occupancy import Occupancy
 from jvr.march.steps import Point, Rays, points_at, segment, segment_count
 from jvr.model.transfer import Classified
-from jvr.numerics import one_minus_exp, two_sum
+from jvr.numerics import computed_once, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
 
@@ -114,17 +114,27 @@ class Progress(NamedTuple):
     last: tuple[Int[Array, "rays"], ...]
 
 
+class Noted(NamedTuple):
+    """What a replay needs of a ray's `Progress` at its end."""
+
+    following: Int[Array, "rays"]
+    front: Channels
+    last: tuple[Int[Array, "rays"], ...]
+
+
 def march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
     """Integrates emission and absorption along every ray (course notes on GPU-based volume ray-casting, Eurographics 2009, eq. 1.8).
 
     Differentiable in forward mode as it stands; `jvr.march.adjoint` adds reverse mode. Detached: the number of segments and
     the decision to end a ray early.
     """
-    return marched(integrate(options, medium, rays, dt))
+    return integrate(options, medium, rays, dt)[0]
 
 
-def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar, *, for_replay: bool = False) -> Progress:
-    """Every ray at its end; `front` and `last` are noted only where a replay will need them."""
+def integrate(
+    options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar, *, for_replay: bool = False
+) -> tuple[Marched, Noted | None]:
+    """What every ray gathered, and where a replay will need it, what that starts from."""
     emits, absorbs = channel_counts(medium, rays, dt)
 
     def start(lanes: Lanes) -> Progress:
@@ -144,9 +154,13 @@ def integrate(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar, *, 
         sums = add_segment(progress.sums, emitted, dtau, u)
         return Progress(sums, k + alive, progress.steps + alive, front, last), None
 
+    def finish(progress: Progress) -> tuple[Marched, Noted | None]:
+        noted = Noted(progress.following, progress.front, progress.last) if for_replay else None
+        return marched(progress), noted
+
     lanes = lanes_of(rays, dt)
     alive = functools.partial(is_alive, options)
-    return pooled_while(alive, advance, start, lambda progress: progress, lanes, None, lanes.segments)[0]
+    return pooled_while(alive, advance, start, finish, lanes, None, lanes.segments)[0]
 
 
 def note_front(progress: Progress, moved: Bool[Array, "rays"], k: Int[Array, "rays"]):
@@ -184,6 +198,8 @@ def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"]
     """Emission and optical depth of segment `k` of every ray, and the distance of its midpoint; zero beyond `count`."""
     extent, u = segment(k, count, lanes.rays.length, dt)
     scalars = tuple(jax.vmap(medium.field.resample)(points) for points in places(medium, lanes.rays, lanes.ray, k, u, extent))
+    # Else every channel of the shader resamples the field for itself.
+    scalars = computed_once(k < count, scalars)
     point = points_at(lanes.rays, lanes.ray, k, u)
     emitted, dtau = jax.vmap(medium.shader.look, in_axes=(None, 0, 0, 0))(medium.transfer, scalars, point, extent)
     return emitted, dtau, u

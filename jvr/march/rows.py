@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jvr.march.adjoint import BackLanes, Behind, segment_cotangents, step_back
 from jvr.march.batch import pooled_while
-from jvr.march.march import Marched, MarchOptions, Medium, integrate, lanes_of, marched, transmittance
+from jvr.march.march import Marched, MarchOptions, Medium, integrate, lanes_of, transmittance
 from jvr.march.steps import Rays, points_at, segment
 from jvr.model.transfer import AbstractTable
 from jvr.types import Scalar
@@ -49,10 +49,11 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
 
     Distances have no rows. Memory: `rays x entries` numbers for each row that `TableRows` lists. Detached as in `march`.
     """
-    end = integrate(options, medium, rays, dt, for_replay=True)
+    gathered, noted = integrate(options, medium, rays, dt, for_replay=True)
     assert isinstance(medium.transfer, AbstractTable)
+    assert noted is not None
     n = medium.transfer.rgb.shape[0]
-    emits, absorbs = len(end.sums.radiance), len(end.front)
+    emits, absorbs = len(gathered.radiance), len(noted.front)
 
     def start(back: BackLanes) -> _RowState:
         zero = jnp.zeros((back.steps.size, n), rays.length.dtype)
@@ -70,9 +71,9 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
         rows = jax.tree.map(lambda row, w: row + sum(hats[i] * w[i][:, None] for i in range(BLOCK)), state.rows, weights)
         return _RowState(behind, j, rows), None
 
-    back = BackLanes(lanes_of(rays, dt), end.following, end.front, end.last)
-    rows, _ = pooled_while(alive, advance, start, lambda state: state.rows, back, None, end.following)
-    return marched(end), rows
+    back = BackLanes(lanes_of(rays, dt), *noted)
+    rows, _ = pooled_while(alive, advance, start, lambda state: state.rows, back, None, noted.following)
+    return gathered, rows
 
 
 def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, behind: Behind, j: Int[Array, "rays"]):

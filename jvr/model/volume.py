@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.checks import affine, float_array, require
+from jvr.model.packing import Squares, squares_of
 from jvr.numerics import read_run
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
 
@@ -84,6 +85,7 @@ class Volume(eqx.Module):
     intercept: Scalar
     interpolation: AbstractInterpolation
     bricks: Bricks | None
+    squares: Squares | None
 
     def __init__(
         self,
@@ -109,6 +111,7 @@ class Volume(eqx.Module):
         self.intercept = float_array(intercept, "intercept", ())
         self.interpolation = interpolation
         self.bricks = None
+        self.squares = None
 
     def bricked(self, size: int = 4) -> "Volume":
         """The same volume with the bounds of its bricks of `size^3` voxels, which empty-space skipping needs; without them each
@@ -120,6 +123,19 @@ class Volume(eqx.Module):
             raise ValueError(f"the size of a brick must be a positive whole number of voxels, not {size!r}; 4 is a good start")
         bricks = jax.jit(bricks_of, static_argnums=1)(jax.lax.stop_gradient(self.values), size)
         return eqx.tree_at(lambda v: v.bricks, self, bricks, is_leaf=lambda x: x is None)
+
+    def packed(self) -> "Volume":
+        """The same volume with its voxels packed for interpolation as well: faster pictures and fits, for 4 more bytes a voxel.
+
+        `uint8` voxels are kept as they are. Others are rounded to 256 levels between the smallest and the largest of them, an error of
+        at most 1/510 of that range, and are no longer differentiable; `slope` and `intercept` make up for it, so that `s` means the same.
+        They belong to these voxels: after replacing `values`, call it again. **Raises** `ValueError` unless interpolation is trilinear.
+        """
+        if not isinstance(self.interpolation, Trilinear):
+            raise ValueError("only trilinear interpolation reads packed voxels: set Volume(interpolation=jvr.Trilinear())")
+        volume = self if self.values.dtype == jnp.uint8 else _quantised(self)
+        squares = jax.jit(squares_of)(volume.values)
+        return eqx.tree_at(lambda v: v.squares, volume, squares, is_leaf=lambda x: x is None)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -156,6 +172,8 @@ class Volume(eqx.Module):
 
     def interpolate(self, p: Triple) -> Scalar:
         """The stored voxels interpolated at one grid position, before slope and intercept."""
+        if self.squares is not None:
+            return self.squares.interpolate(p)
         voxels, value = self.values.reshape(-1), jnp.zeros_like(p[0])
         for start, weights in self.interpolation.stencil(self.shape, p):
             run = read_run(voxels, start, len(weights))
@@ -175,6 +193,17 @@ class Volume(eqx.Module):
         if not direction:
             x = tuple(x[i] - self.world_from_grid[i, 3] for i in range(3))
         return tuple(sum((inverse[i, j] * x[j] for j in range(3)), jnp.zeros_like(x[i])) for i in range(3))
+
+
+def _quantised(volume: Volume) -> Volume:
+    """The volume with `uint8` voxels."""
+    values = jax.lax.stop_gradient(volume.values).astype(volume.slope.dtype)
+    low, high = jnp.min(values), jnp.max(values)
+    scale = jnp.where(high > low, (high - low) / 255, 1.0)
+    levels = jnp.round((values - low) / scale).astype(jnp.uint8)
+    slope, intercept = volume.slope * scale, volume.slope * low + volume.intercept
+    parts = lambda v: (v.values, v.slope, v.intercept, v.bricks)
+    return eqx.tree_at(parts, volume, (levels, slope, intercept, None), is_leaf=lambda x: x is None)
 
 
 class ClippingBox(eqx.Module):

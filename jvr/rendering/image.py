@@ -1,5 +1,7 @@
 """`jvr.render`: a scene seen by a camera."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
+from jvr.rendering.parts import in_parts, is_traced
 from jvr.rendering.plan import medium, occupancy
 from jvr.rendering.settings import Settings
 from jvr.types import Image, Scalar, Triple
@@ -45,12 +48,15 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
     Traceable; `jax.jit(jvr.render)` compiles once for each structure of the scene, size of the picture and settings. A camera
     with non-finite numbers gives NaN pixels.
     """
-    pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
-    where = occupancy(scene, settings)
-    if pixels.size <= settings.tile:
-        rgb, alpha, depth, steps = _render_pixels(scene, camera, settings, where, pixels)
+    if is_traced((scene, camera)):
+        pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
+        where = occupancy(scene, settings)
+        march = _render_pixels if pixels.size <= settings.tile else _render_tiles
+        rgb, alpha, depth, steps = march(scene, camera, settings, where, pixels)
     else:
-        rgb, alpha, depth, steps = _render_tiles(scene, camera, settings, where, pixels)
+        where = _compiled_occupancy(scene, settings)
+        part = functools.partial(_compiled_pixels, scene, camera, settings, where)
+        rgb, alpha, depth, steps = in_parts(part, camera.height, camera.width, settings.tile)
     shape = (camera.height, camera.width)
     return Rendering(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape), RenderStats(steps.reshape(shape)))
 
@@ -138,3 +144,7 @@ def _render_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, wher
     padded = jnp.minimum(jnp.arange(count * settings.tile, dtype=jnp.int32), pixels.size - 1).reshape(count, settings.tile)
     tiles = jax.lax.map(lambda tile: _render_pixels(scene, camera, settings, where, tile), padded)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: pixels.size], tiles)
+
+
+_compiled_pixels = jax.jit(_render_pixels, static_argnums=2)
+_compiled_occupancy = jax.jit(occupancy, static_argnums=1)

@@ -87,7 +87,7 @@ def _program(settings: Settings, unknowns: Callable[[Scene], Any] | None) -> Cal
         return 0.5 * jnp.mean(jnp.square(image.rgb)), (image.rgb, jnp.sum(image.stats.steps))
 
     if unknowns is None:
-        return eqx.filter_jit(lambda scene, camera: (*picture(scene, camera)[1], None))
+        return lambda scene, camera: (*picture(scene, camera)[1], None)
 
     def with_gradient(scene: Scene, camera: AbstractCamera):
         into = lambda values: eqx.tree_at(unknowns, scene, values)

@@ -88,7 +88,9 @@ def build_volume(config: Config) -> Volume:
         low, high = table.scale
         scaled = (np.asarray(values, np.float64) * float(slope) + float(intercept) - low) / (high - low)
         values, slope, intercept = np.clip(scaled, 0, 1).astype(np.float32), 1.0, 0.0
-    return Volume(values, volume.world_from_grid, slope=slope, intercept=intercept, interpolation=interpolation)
+    volume = Volume(values, volume.world_from_grid, slope=slope, intercept=intercept, interpolation=interpolation)
+    with blame(config.name, "volume.packed"):
+        return volume.packed() if table.packed else volume
 
 
 def build_scene(config: Config, volume: Volume | None = None) -> Scene:
@@ -130,8 +132,8 @@ def build_fit(config: Config, read_image: Callable[[Path], np.ndarray] | None = 
         (inside, targets), held_out = _held_out_images(config, fit, cameras, images)
         return FitJob(scene, inside, targets, None, held_out, keywords)
     truth = _transfer(config, tables.truth, volume, "truth")
-    true_scene, program = _scene(config, volume, truth), jax.jit(render)
-    picture = lambda camera: np.asarray(program(true_scene, camera, settings).rgb)
+    true_scene = _scene(config, volume, truth)
+    picture = lambda camera: np.asarray(render(true_scene, camera, settings).rgb)
     extra = _extra_cameras(config, fit, cameras, volume)
     inside, outside = ([c for c, out in extra if out == which] for which in (False, True))
     held_out = (tuple(outside), tuple(map(picture, outside))) if outside else None

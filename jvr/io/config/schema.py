@@ -65,6 +65,7 @@ class VolumeTable(Table):
     nan_value: Scalar | None = None
     interpolation: Literal["trilinear", "nearest"] = "trilinear"
     scale: Range | None = None
+    packed: bool = False
 
     @model_validator(mode="after")
     def _check(self) -> "VolumeTable":

@@ -1,0 +1,155 @@
+"""Pictures of arrays at hand, in parts; volumes packed for interpolation."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import lut_transfer, perspective, render, voxels
+
+import jvr
+from jvr import parallel
+from jvr.rendering import parts
+
+
+@pytest.fixture
+def small_parts(monkeypatch):
+    monkeypatch.setattr(parts, "LEAST", 50)
+    monkeypatch.setattr(parts, "workers", lambda: 3)
+    monkeypatch.setattr(parallel, "workers", lambda: 3)
+
+
+def scene_of(seed, dtype=np.uint8, shape=(9, 7, 8), **options):
+    values = np.random.default_rng(seed).integers(0, 256, shape).astype(dtype)
+    volume = jvr.Volume(values, slope=1 / 255, **options)
+    return jvr.Scene(volume, lut_transfer(), background=(0.2, 0.1, 0.3))
+
+
+@pytest.mark.parametrize(("width", "height", "tile"), [(16, 13, 10**6), (16, 13, 40), (5, 2, 1), (1, 1, 1)])
+def test_parts_make_the_picture_of_one_program(small_parts, width, height, tile):
+    """Numbers of rows that parts do not divide, parts of one row, and more workers than rows."""
+    scene, camera = scene_of(0), perspective(jvr.Volume(np.zeros((9, 7, 8))), width, height)
+    ours, whole = jvr.render(scene, camera, jvr.Settings(0.7, tile=tile)), render(scene, camera, jvr.Settings(0.7))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), ours, whole)
+
+
+def test_double_precision_reaches_the_threads(small_parts, x64):
+    scene = scene_of(0)
+    picture = jvr.render(scene, perspective(scene.volume, 16, 13), jvr.Settings(0.7))
+    assert picture.rgb.dtype == jnp.float64
+
+
+def test_arrays_that_a_traced_function_closes_over_are_part_of_it():
+    scene = scene_of(0)
+    camera = perspective(scene.volume, 8, 6)
+    traced = jax.make_jaxpr(lambda x: x + jvr.render(scene, camera).rgb)(0.0)
+    assert "while[" in str(traced)
+
+
+def test_out_of_memory_halves_the_parts_with_one_warning(small_parts):
+    sizes = []
+
+    def function(pixels):
+        sizes.append(pixels.size)
+        if pixels.size > 20:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 bytes.")
+        return 2 * pixels
+
+    with pytest.warns(RuntimeWarning, match="out of memory") as warned:
+        found = parts.in_parts(function, 13, 10, 10**6)
+    np.testing.assert_array_equal(found, 2 * np.arange(130))
+    assert len(warned) == 1
+    assert max(sizes) == 50
+    assert sizes[-1] == 20
+
+
+def test_what_does_not_fit_at_all_and_other_failures_are_raised(small_parts):
+    def fails(message):
+        def function(_):
+            raise jax.errors.JaxRuntimeError(message)
+
+        return function
+
+    with pytest.warns(RuntimeWarning), pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
+        parts.in_parts(fails("RESOURCE_EXHAUSTED: Out of memory"), 13, 10, 10**6)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
+        parts.in_parts(fails("INTERNAL: else"), 13, 10, 10**6)
+
+
+def test_one_compilation_while_only_arrays_change():
+    camera = perspective(jvr.Volume(np.zeros((9, 7, 8))), 12, 9)
+    jvr.render(scene_of(0), camera)
+    with jax.log_compiles(), _compilations() as names:
+        for seed in range(1, 4):
+            jvr.render(scene_of(seed), camera)
+    assert names == []
+
+
+class _compilations:
+    """Names of what is compiled meanwhile."""
+
+    def __enter__(self):
+        import logging
+
+        self.names, self.handler = [], logging.Handler()
+        self.handler.emit = lambda record: self.names.append(record.getMessage()) if "Compiling" in record.getMessage() else None
+        logging.getLogger("jax").addHandler(self.handler)
+        return self.names
+
+    def __exit__(self, *_):
+        import logging
+
+        logging.getLogger("jax").removeHandler(self.handler)
+
+
+SHAPES = st.tuples(*[st.integers(1, 9)] * 3)
+values_at = jax.jit(lambda volume, points: jax.vmap(volume.sample)(points))
+
+
+@given(st.integers(0, 2**31), SHAPES)
+@settings(max_examples=20, deadline=None)
+def test_packed_voxels_are_the_voxels(seed, shape):
+    rng = np.random.default_rng(seed)
+    volume = jvr.Volume(rng.integers(0, 256, shape).astype(np.uint8), slope=2.0, intercept=-3.0)
+    points = tuple(jnp.asarray(rng.uniform(0, max(n - 1, 0.001), 50), jnp.float32) for n in shape)
+    np.testing.assert_allclose(values_at(volume.packed(), points), values_at(volume, points), rtol=1e-5, atol=1e-3)
+    corners = tuple(jnp.full(1, n - 1.0) for n in shape)
+    assert values_at(volume.packed(), corners)[0] == 2.0 * float(volume.values[-1, -1, -1]) - 3.0
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.float32, np.int8])
+def test_other_voxels_are_rounded_to_256_levels(dtype):
+    values = voxels((9, 7, 8)) * 100
+    volume = jvr.Volume(values.astype(dtype), slope=-2.0, intercept=5.0)
+    packed = volume.packed()
+    exact, rounded = (np.asarray(v.slope * v.values + v.intercept, float) for v in (volume, packed))
+    spread = exact.max() - exact.min()
+    assert packed.values.dtype == np.uint8
+    assert 0 < np.abs(exact - rounded).max() <= spread / 510 * 1.001
+    np.testing.assert_allclose([rounded.min(), rounded.max()], [exact.min(), exact.max()], rtol=1e-6)
+
+
+def test_packed_pictures_and_gradients_are_the_same():
+    scene = scene_of(3)
+    packed = eqx.tree_at(lambda s: s.volume, scene, scene.volume.packed())
+    camera = perspective(scene.volume, 12, 9)
+
+    def loss(sigma_t, slope, scene):
+        scene = eqx.tree_at(lambda s: (s.transfer.sigma_t, s.volume.slope), scene, (sigma_t, slope))
+        return jnp.mean(jvr.render(scene, camera, jvr.Settings(0.7)).rgb ** 2)
+
+    of = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
+    both = [of(s.transfer.sigma_t, s.volume.slope, s) for s in (scene, packed)]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=1e-6), *both)
+
+
+def test_constant_voxels_can_be_packed():
+    packed = jvr.Volume(np.full((3, 3, 3), 7.5)).packed()
+    assert float(packed.sample(tuple(jnp.array([1.5, 0.5, 1.0])))) == 7.5
+
+
+def test_nearest_voxels_are_not_packed():
+    with pytest.raises(ValueError, match="trilinear"):
+        jvr.Volume(np.zeros((3, 3, 3)), interpolation=jvr.Nearest()).packed()
