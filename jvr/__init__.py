@@ -28,6 +28,8 @@ from jvr.rendering.image import Rendering as Rendering
 from jvr.rendering.image import RenderStats as RenderStats
 from jvr.rendering.image import render as render
 from jvr.rendering.plan import plan as plan
+from jvr.rendering.sampling import Refinement as Refinement
+from jvr.rendering.sampling import Uniform as Uniform
 from jvr.rendering.settings import Settings as Settings
 from jvr.types import Outcome as Outcome
 

@@ -217,6 +217,18 @@ def test_settings_become_objects():
     assert made == jvr.Settings(2.0, quadrature=jvr.PreIntegrated(), skipping=False)
 
 
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("'uniform'", jvr.Uniform()),
+        ("'refinement'", jvr.Refinement()),
+        ("{kind='refinement', tolerance=0.02, tile=16}", jvr.Refinement(0.02, tile=16)),
+    ],
+)
+def test_a_sampling_is_a_name_or_a_table(text, wanted):
+    assert build_settings(config(BASE, f"settings.sampling={text}")) == jvr.Settings(sampling=wanted)
+
+
 def test_names_become_objects():
     made = config(
         BASE + "[truth]\nkind = 'window'\n[fit]\n",

@@ -17,6 +17,7 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import enter, step_length
 from jvr.rendering.plan import medium
+from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
 from jvr.types import Triple
 
@@ -95,6 +96,8 @@ def observe(
     """
     if not isinstance(settings.quadrature, Midpoint):
         raise ValueError("a fit resamples the midpoints of segments: leave Settings(quadrature=...) at jvr.Midpoint()")
+    if not isinstance(settings.sampling, Uniform):
+        raise ValueError("a fit takes every sample of every ray: leave Settings(sampling=...) at jvr.Uniform()")
     rays = [camera.rays(jnp.arange(camera.width * camera.height, dtype=jnp.int32)) for camera in cameras]
     origin, direction = jax.tree.map(lambda *parts: np.concatenate(parts), *rays)
     target = np.concatenate([image.reshape(-1, 3) for image in images])

@@ -15,14 +15,22 @@ from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
 from jvr.rendering.parts import in_parts, is_traced
 from jvr.rendering.plan import medium, occupancy
+from jvr.rendering.sampling import RefinementStats
 from jvr.rendering.settings import Settings
 from jvr.types import Image, Scalar, Triple
 
 
 class RenderStats(eqx.Module):
-    """What a rendering took: `steps`, segments sampled for each pixel, `(height, width)`."""
+    """What a rendering took: `steps`, segments sampled for each pixel, `(height, width)`, and what `Settings(sampling=...)` left out,
+    `None` where that is nothing."""
 
     steps: Int[Array, "height width"]
+    sampling: RefinementStats | None = None
+
+    @property
+    def samples(self) -> Int[Array, ""]:
+        """Samples taken for the whole picture."""
+        return jnp.sum(self.steps)
 
 
 class Rendering(eqx.Module):
@@ -44,10 +52,16 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
     """Renders `scene` as `camera` sees it, by emission and absorption along the ray of each pixel.
 
     Differentiable in every floating-point array of `scene` and `camera`: transfer function, voxels, pose, background, and where rays
-    enter and leave the volume. Detached: the number of segments and early termination. `settings.adjoint` says in which mode.
+    enter and leave the volume. Detached: the number of segments, early termination, and which samples `settings.sampling` takes.
+    `settings.adjoint` says in which mode.
     Traceable; `jax.jit(jvr.render)` compiles once for each structure of the scene, size of the picture and settings. A camera
-    with non-finite numbers gives NaN pixels.
+    with non-finite numbers gives NaN pixels. **Raises** `ValueError` where `settings.sampling` does not support the scene.
     """
+    return settings.sampling.render(scene, camera, settings)
+
+
+def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> Rendering:
+    """`render` with every ray and every visible sample."""
     if is_traced((scene, camera)):
         pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
         where = occupancy(scene, settings)

@@ -84,7 +84,7 @@ def _program(settings: Settings, unknowns: Callable[[Scene], Any] | None) -> Cal
 
     def picture(scene: Scene, camera: AbstractCamera):
         image = render(scene, camera, settings)
-        return 0.5 * jnp.mean(jnp.square(image.rgb)), (image.rgb, jnp.sum(image.stats.steps))
+        return 0.5 * jnp.mean(jnp.square(image.rgb)), (image.rgb, image.stats.samples)
 
     if unknowns is None:
         return lambda scene, camera: (*picture(scene, camera)[1], None)

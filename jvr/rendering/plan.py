@@ -17,6 +17,7 @@ from jvr.model.preintegration import PreIntegratedTable
 from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
 from jvr.model.volume import Volume
+from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
 from jvr.types import Channels, Scalar
 
@@ -106,6 +107,7 @@ def plan(scene: Scene, settings: Settings = Settings()) -> Plan:
     quadrature = settings.quadrature
     parts = (
         Part("volume", True, f"{voxels}, {type(volume.interpolation).__name__.lower()}, a sample every {settings.step:g} voxels"),
+        Part("adaptive sampling", not isinstance(settings.sampling, Uniform), settings.sampling.explanation),
         Part("transfer", True, f"{type(transfer).__name__}, {'coloured' if coloured else 'grey'} extinction"),
         Part("pre-integration", isinstance(quadrature, PreIntegrated), quadrature.explanation),
         Part("optical model", True, type(scene.optical).__name__),

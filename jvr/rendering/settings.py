@@ -6,6 +6,7 @@ import equinox as eqx
 
 from jvr.march.differentiation import AbstractAdjoint, Replay
 from jvr.march.quadrature import AbstractQuadrature, Midpoint
+from jvr.rendering.sampling import AbstractSampling, Uniform
 
 
 class Settings(eqx.Module):
@@ -20,6 +21,7 @@ class Settings(eqx.Module):
     - `skipping`: whether rays leap over bricks of the volume that the transfer function leaves empty. The picture is the same to
       rounding; what gradients skip is what has none.
     - `adjoint`: how derivatives are computed: `jvr.Replay()` (reverse mode, default), `jvr.Forward()` or `jvr.Rows()`.
+    - `sampling`: which samples are taken: `jvr.Uniform()` (default: all) or `jvr.Refinement()`.
     - `tile`: rays marched at a time. Memory is about 120 bytes a ray; smaller tiles need less and take longer.
 
     **Raises** `ValueError` for values out of range.
@@ -30,6 +32,7 @@ class Settings(eqx.Module):
     quadrature: AbstractQuadrature
     skipping: bool = eqx.field(static=True)
     adjoint: AbstractAdjoint
+    sampling: AbstractSampling
     tile: int = eqx.field(static=True)
 
     def __init__(
@@ -40,6 +43,7 @@ class Settings(eqx.Module):
         quadrature: AbstractQuadrature = Midpoint(),
         skipping: bool = True,
         adjoint: AbstractAdjoint = Replay(),
+        sampling: AbstractSampling = Uniform(),
         tile: int = 262_144,
     ):
         if isinstance(step, bool) or not isinstance(step, int | float) or not (math.isfinite(step) and step > 0):
@@ -54,9 +58,12 @@ class Settings(eqx.Module):
             raise ValueError(f"tile must be a positive number of rays, not {tile!r}")
         if not isinstance(adjoint, AbstractAdjoint):
             raise TypeError(f"adjoint must be jvr.Replay(), jvr.Forward() or jvr.Rows(), not {adjoint!r}")
+        if not isinstance(sampling, AbstractSampling):
+            raise TypeError(f"sampling must be jvr.Uniform() or jvr.Refinement(), not {sampling!r}")
         self.step = float(step)
         self.termination = float(termination)
         self.quadrature = quadrature
         self.skipping = skipping
         self.adjoint = adjoint
+        self.sampling = sampling
         self.tile = tile

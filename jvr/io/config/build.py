@@ -14,10 +14,12 @@ from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.load import Config
 from jvr.io.config.schema import (
     AnyCamera,
+    AnySampling,
     AnyTransfer,
     FitTable,
     OrthographicTable,
     PerspectiveTable,
+    RefinementTable,
     RigTable,
     TransferFile,
     VolumeTable,
@@ -31,6 +33,7 @@ from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTransfer, LutTransfer
 from jvr.model.volume import ClippingBox, Nearest, Trilinear, Volume
 from jvr.rendering.image import render
+from jvr.rendering.sampling import AbstractSampling, Refinement, Uniform
 from jvr.rendering.settings import Settings
 
 QUADRATURES = {"midpoint": Midpoint, "pre-integrated": PreIntegrated}
@@ -71,6 +74,7 @@ def build_settings(config: Config) -> Settings:
             quadrature=QUADRATURES[table.quadrature](),
             skipping=table.skipping,
             adjoint=ADJOINTS[table.adjoint](),
+            sampling=_sampling(table.sampling),
             tile=table.tile,
         )
 
@@ -138,6 +142,12 @@ def build_fit(config: Config, read_image: Callable[[Path], np.ndarray] | None = 
     inside, outside = ([c for c, out in extra if out == which] for which in (False, True))
     held_out = (tuple(outside), tuple(map(picture, outside))) if outside else None
     return FitJob(scene, tuple(inside), tuple(map(picture, inside)), truth, held_out, keywords)
+
+
+def _sampling(table: AnySampling) -> AbstractSampling:
+    if isinstance(table, RefinementTable):
+        return Refinement(table.tolerance, tile=table.tile)
+    return Uniform()
 
 
 def _builtin() -> Volume:

@@ -19,7 +19,7 @@ SENTENCES = {
 }
 # Pydantic puts the name of the alternative that it tried into the place of an error.
 KINDS = ("linear", "lut", "gaussian", "sampled", "preset", "window", "file")
-KINDS += ("perspective", "orthographic", "fibonacci", "orbit", "ramp")
+KINDS += ("perspective", "orthographic", "fibonacci", "orbit", "ramp", "uniform", "slices", "refinement")
 
 
 class ConfigError(ValueError):

@@ -248,6 +248,29 @@ AnyCamera = Annotated[PerspectiveTable | OrthographicTable | RigTable, Field(dis
 Cameras = Annotated[list[AnyCamera], BeforeValidator(_cameras), Field(min_length=1)]
 
 
+class UniformTable(Table):
+    """`jvr.Uniform`."""
+
+    kind: Literal["uniform"]
+
+
+class RefinementTable(Table):
+    """`jvr.Refinement`."""
+
+    kind: Literal["refinement"]
+    tolerance: Annotated[float, number("radiance and opacity, 0 for every ray", 0.0)] = 0.005
+    tile: Literal[2, 4, 8, 16, 32, 64] = 8
+
+
+def _sampling(value: Any) -> Any:
+    """A table, or the name of a kind with its defaults."""
+    return {"kind": value} if isinstance(value, str) else value
+
+
+AnySampling = Annotated[UniformTable | RefinementTable, Field(discriminator="kind")]
+Sampling = Annotated[AnySampling, BeforeValidator(_sampling)]
+
+
 class SettingsTable(Table):
     """`jvr.Settings`."""
 
@@ -257,6 +280,7 @@ class SettingsTable(Table):
     skipping: bool = True
     tile: Annotated[int, whole("rays at a time", 1)] = 262_144
     adjoint: Literal["replay", "forward", "rows"] = "replay"
+    sampling: Sampling = UniformTable(kind="uniform")
 
 
 class StartTable(Table):

@@ -1,0 +1,79 @@
+"""Which samples a picture is made of: the choices that `Settings(sampling=...)` takes."""
+
+import abc
+import math
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Int
+
+if TYPE_CHECKING:
+    # What renders knows the settings, which know this.
+    from jvr.rendering.image import Rendering
+
+TILES = (2, 4, 8, 16, 32, 64)
+
+
+class AbstractSampling(eqx.Module):
+    """A choice of samples. Static, without arrays."""
+
+    @property
+    @abc.abstractmethod
+    def explanation(self) -> str:
+        """What it does, for `jvr.plan`."""
+
+    @abc.abstractmethod
+    def render(self, scene: Any, camera: Any, settings: Any) -> "Rendering":
+        """The picture. **Raises** `ValueError` for scenes and settings that this choice does not support."""
+
+
+class Uniform(AbstractSampling):
+    """Every pixel's ray, and every sample of a ray that can be seen. The default."""
+
+    @property
+    def explanation(self) -> str:
+        return "every ray, evenly spaced samples"
+
+    def render(self, scene: Any, camera: Any, settings: Any) -> "Rendering":
+        from jvr.rendering.image import render_uniform
+
+        return render_uniform(scene, camera, settings)
+
+
+class Refinement(AbstractSampling):
+    """Rays far apart where the picture is smooth: first every `tile`-th and `tile / 2`-th pixel, in rows and in columns, then those
+    between where interpolation was wrong by more than `tolerance` (`jvr.rendering.refinement`).
+
+    **Arguments:** `tolerance`: in radiance and opacity, 0 (every ray) or more. It bounds what interpolation was wrong by on the grid
+    before, so the picture's root mean square error stays well below it; single pixels at an edge may be farther off. `tile`: a
+    power of two, 2 ... 64; features smaller than half of it are missed where none of its rays meets them. **Raises** `ValueError` for
+    values out of range.
+    """
+
+    tolerance: float = eqx.field(static=True)
+    tile: int = eqx.field(static=True)
+
+    def __init__(self, tolerance: float | int = 0.005, *, tile: int = 8):
+        if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not 0 <= tolerance < math.inf:
+            raise ValueError(f"Refinement tolerance must be a radiance, 0 or more, not {tolerance!r}; 0.005 is a good start")
+        if isinstance(tile, bool) or tile not in TILES:
+            raise ValueError(f"Refinement tile must be a power of two from 2 to 64 pixels, not {tile!r}; 8 is a good start")
+        self.tolerance = float(tolerance)
+        self.tile = tile
+
+    @property
+    def explanation(self) -> str:
+        return f"every {self.tile // 2}th ray, those between where interpolation is wrong by more than {self.tolerance:g}"
+
+    def render(self, scene: Any, camera: Any, settings: Any) -> "Rendering":
+        from jvr.rendering.refinement import render_refined
+
+        return render_refined(scene, camera, settings, self)
+
+
+class RefinementStats(eqx.Module):
+    """What `Refinement` traced: `traced`, the pixels, and `rays`, their number and that of the rays around the picture that its border
+    is interpolated from."""
+
+    traced: Bool[Array, "height width"]
+    rays: Int[Array, ""]
