@@ -13,6 +13,8 @@ from benchmarks.peers.worker import Worker
 from benchmarks.timing import median, ratio
 
 USUAL_STEP = 0.5
+# Where the packed one reaches the error, too, the faster of the two counts.
+OURS = ("jvr", "jvr_packed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +39,7 @@ def forward(scene: Scene, present: list[str], repeats: int) -> dict[str, Any]:
     """Pictures at the error of VTK's ray caster, taken at the longest step within 5 % of its best; without VTK, at that of `jvr`
     with half-voxel steps. Every other renderer takes its longest step that reaches this error."""
     reference = _reference(scene, "picture")
-    names = [name for name in ("vtk", "vtk_gpu", "compiled", "jvr") if name in present]
+    names = [name for name in ("vtk", "vtk_gpu", "compiled", *OURS) if name in present]
     with running(names, scene) as (workers, failed):
         leader = "vtk" if "vtk" in workers else "jvr"
         usual = lambda worker: (USUAL_STEP, error_at(worker, USUAL_STEP, reference))
@@ -48,11 +50,12 @@ def forward(scene: Scene, present: list[str], repeats: int) -> dict[str, Any]:
         for name, worker in workers.items():
             worker.call("prepare", chosen[name][0])
         times = _times(workers, "draw", repeats)
+        good = [name for name in OURS if name in workers and chosen[name][1] <= target] or ["jvr"]
         return {
             **_about(scene),
             "target_rmse": target,
             "renderers": _rows(workers, chosen, times, "draw", target) | _failures(failed),
-            "jvr_over": {name: ratio(times, "jvr", name) for name in workers if name != "jvr"},
+            "jvr_over": {name: min(ratio(times, ours, name) for ours in good) for name in workers if name not in OURS},
         }
 
 

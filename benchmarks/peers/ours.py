@@ -28,7 +28,7 @@ class Renderer:
 
     def prepare(self, step: float) -> None:
         settings = jvr.Settings(step, termination=TERMINATION)
-        self._image = jax.jit(lambda scene, camera: jvr.render(scene, camera, settings).rgb)
+        self._image = lambda scene, camera: jvr.render(scene, camera, settings).rgb
         loss = lambda entries, scene, camera: _loss(entries, scene, camera, settings)
         self._gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))
 
@@ -49,6 +49,15 @@ class Renderer:
     def gradient_error(self, reference: tuple[np.ndarray, np.ndarray]) -> tuple[float, float]:
         """Relative errors in the colours and in the extinctions."""
         return relative(self.slope[0], reference[0]), relative(self.slope[1], reference[1])
+
+
+class Packed(Renderer):
+    """The same with 8-bit voxels, packed."""
+
+    def __init__(self, scene: scenes.Scene):
+        super().__init__(scene)
+        volume = lambda s: s.volume
+        self.scene = eqx.tree_at(volume, self.scene, self.scene.volume.packed().bricked(), is_leaf=lambda x: x is None)
 
 
 class Reference:

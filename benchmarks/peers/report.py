@@ -9,6 +9,7 @@ from typing import Any
 BEGIN, END = "<!-- results -->", "<!-- end of results -->"
 NAMES = {
     "jvr": "jvr",
+    "jvr_packed": "jvr, 8 bits packed",
     "vtk": "VTK fixed-point",
     "vtk_gpu": "VTK GPU mapper",
     "compiled": "C++ loop",
@@ -16,10 +17,10 @@ NAMES = {
     "mitsuba": "Mitsuba",
 }
 FIGURES = {
-    "forward_jvr_over_vtk": "picture, jvr / VTK fixed-point, median of the scenes",
-    "forward_jvr_over_vtk_gpu": "picture, jvr / VTK GPU mapper, median of the scenes",
-    "forward_jvr_over_compiled": "picture, jvr / C++ loop, median of the scenes",
-    "gradient_torch_over_jvr": "picture and gradient, PyTorch / jvr, median of the scenes",
+    "forward_jvr_over_vtk": "picture, jvr / VTK fixed-point, worst of the scenes",
+    "forward_jvr_over_vtk_gpu": "picture, jvr / VTK GPU mapper, worst of the scenes",
+    "forward_jvr_over_compiled": "picture, jvr / C++ loop, worst of the scenes",
+    "gradient_torch_over_jvr": "picture and gradient, PyTorch / jvr, worst of the scenes",
     "absorption_mitsuba_over_jvr": "absorbing medium, Mitsuba / jvr",
     "fit_over_torch_gradient": "whole fit to 60 dB in jvr / one gradient over the same views in PyTorch",
     "picture_in_8_times_the_box": "jvr, the same object in a box of 8 times the volume: picture",

@@ -1,7 +1,6 @@
 """All comparisons in one run."""
 
 import os
-import statistics
 import sys
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -60,14 +59,14 @@ def installed() -> tuple[dict[str, str], dict[str, str]]:
 
 
 def _with_figures(result: dict[str, Any]) -> dict[str, Any]:
-    """Adds medians over the scenes, and what is a single number anyway; `None` where a peer was absent."""
+    """Adds the worst over the scenes, and what is a single number anyway; `None` where a peer was absent."""
     over = lambda table, key, name: [row[key][name] for row in result[table] if name in row.get(key, {})]
-    middle = lambda values: statistics.median(values) if values else None
+    most, least = (lambda values, f=f: f(values) if values else None for f in (max, min))
     result["figures"] = {
-        "forward_jvr_over_vtk": middle(over("forward", "jvr_over", "vtk")),
-        "forward_jvr_over_vtk_gpu": middle(over("forward", "jvr_over", "vtk_gpu")),
-        "forward_jvr_over_compiled": middle(over("forward", "jvr_over", "compiled")),
-        "gradient_torch_over_jvr": middle(over("gradient", "over_jvr", "torch")),
+        "forward_jvr_over_vtk": most(over("forward", "jvr_over", "vtk")),
+        "forward_jvr_over_vtk_gpu": most(over("forward", "jvr_over", "vtk_gpu")),
+        "forward_jvr_over_compiled": most(over("forward", "jvr_over", "compiled")),
+        "gradient_torch_over_jvr": least(over("gradient", "over_jvr", "torch")),
         "absorption_mitsuba_over_jvr": result["absorption"].get("over_jvr", {}).get("mitsuba"),
         "fit_over_torch_gradient": result["fit"].get("fit_over_torch_gradient"),
         **{name: value for name, value in result["empty_space"].items() if name != "failed"},

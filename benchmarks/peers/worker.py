@@ -19,6 +19,7 @@ from benchmarks.peers.settings import THREADS
 # What a worker is called: its module here, and the class that it makes one of.
 RENDERERS = {
     "jvr": ("ours", "Renderer"),
+    "jvr_packed": ("ours", "Packed"),
     "vtk": ("vtk_mappers", "Renderer"),
     "vtk_gpu": ("vtk_mappers", "GpuRenderer"),
     "compiled": ("compiled", "Renderer"),

@@ -203,9 +203,11 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marc
         transfer, shader, rays, dt = eqx.combine(small, rest)
         extent, u = segment(k, count, rays.length, dt)
         sampled = places(medium, rays, lanes.ray, k, u, extent)
-        scalars = tuple(jax.vmap(medium.field.resample)(points) + tap for points, tap in zip(sampled, taps, strict=True))
+        resampled = computed_once(k < count, tuple(jax.vmap(medium.field.resample)(points) for points in sampled))
+        scalars = tuple(s + tap for s, tap in zip(resampled, taps, strict=True))
         point = points_at(rays, lanes.ray, k, u)
-        return (*jax.vmap(shader.look, in_axes=(None, 0, 0, 0))(transfer, scalars, point, extent), u), sampled
+        looks = jax.vmap(shader.look, in_axes=(None, 0, 0, 0))(transfer, scalars, point, extent)
+        return (*computed_once(k < count, looks), u), sampled
 
     taps = (jnp.zeros_like(lanes.rays.length),) * len(medium.shader.places)
     (emitted, dtau, u), pull, sampled = jax.vjp(local, small, taps, has_aux=True)

@@ -13,13 +13,13 @@ Shared = TypeVar("Shared")
 Results = TypeVar("Results")
 
 # Lanes in the pool: enough for every core to have work at each step, few enough for their state to stay in the cache.
-POOL = 8192
+POOL = 6144
 # The share of lanes that may idle before they are filled again.
 IDLE = 0.25
 # Neighbouring rays that are put in order together.
 TOGETHER = 16
 # Lanes of the smaller pool that the last rays end in, so that a few long ones do not pay for all the others' lanes.
-TAIL = 1024
+TAIL = 512
 
 
 def pooled_while(
