@@ -6,6 +6,10 @@ from typing import TYPE_CHECKING, Any
 from jvr.march.differentiation import Forward as Forward
 from jvr.march.differentiation import Replay as Replay
 from jvr.march.differentiation import Rows as Rows
+from jvr.march.oracle import BrickRange as BrickRange
+from jvr.march.oracle import Finest as Finest
+from jvr.march.oracle import LocalError as LocalError
+from jvr.march.oracle import OpacityChange as OpacityChange
 from jvr.march.quadrature import Midpoint as Midpoint
 from jvr.march.quadrature import PreIntegrated as PreIntegrated
 from jvr.model import presets as presets
@@ -29,6 +33,7 @@ from jvr.rendering.image import RenderStats as RenderStats
 from jvr.rendering.image import render as render
 from jvr.rendering.plan import plan as plan
 from jvr.rendering.sampling import Refinement as Refinement
+from jvr.rendering.sampling import Slices as Slices
 from jvr.rendering.sampling import Uniform as Uniform
 from jvr.rendering.settings import Settings as Settings
 from jvr.types import Outcome as Outcome

@@ -223,6 +223,9 @@ def test_settings_become_objects():
         ("'uniform'", jvr.Uniform()),
         ("'refinement'", jvr.Refinement()),
         ("{kind='refinement', tolerance=0.02, tile=16}", jvr.Refinement(0.02, tile=16)),
+        ("'slices'", jvr.Slices()),
+        ("{kind='slices', oracle='brick-range', tolerance=0.02, levels=2}", jvr.Slices(jvr.BrickRange(0.02), levels=2)),
+        ("{kind='slices', oracle='finest'}", jvr.Slices(jvr.Finest())),
     ],
 )
 def test_a_sampling_is_a_name_or_a_table(text, wanted):

@@ -15,7 +15,7 @@ from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
 from jvr.rendering.parts import in_parts, is_traced
 from jvr.rendering.plan import medium, occupancy
-from jvr.rendering.sampling import RefinementStats
+from jvr.rendering.sampling import RefinementStats, SliceStats
 from jvr.rendering.settings import Settings
 from jvr.types import Image, Scalar, Triple
 
@@ -25,12 +25,12 @@ class RenderStats(eqx.Module):
     `None` where that is nothing."""
 
     steps: Int[Array, "height width"]
-    sampling: RefinementStats | None = None
+    sampling: SliceStats | RefinementStats | None = None
 
     @property
     def samples(self) -> Int[Array, ""]:
-        """Samples taken for the whole picture."""
-        return jnp.sum(self.steps)
+        """Samples taken for the whole picture, counted once where segments share them."""
+        return jnp.sum(self.sampling.samples if isinstance(self.sampling, SliceStats) else self.steps)
 
 
 class Rendering(eqx.Module):

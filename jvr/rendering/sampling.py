@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 from jaxtyping import Array, Bool, Int
 
+from jvr.march.oracle import AbstractOracle, LocalError
+
 if TYPE_CHECKING:
     # What renders knows the settings, which know this.
     from jvr.rendering.image import Rendering
@@ -40,6 +42,38 @@ class Uniform(AbstractSampling):
         return render_uniform(scene, camera, settings)
 
 
+class Slices(AbstractSampling):
+    """Samples on slices across the view, far apart where an oracle allows it, along the view and across it; between them the scalar is
+    interpolated, by B-splines across the view and by pre-integration along it (`jvr.rendering.adaptive`).
+
+    **Arguments:** `oracle`: says how far apart samples may be, within its tolerance: `jvr.LocalError()` (default),
+    `jvr.OpacityChange()`, `jvr.BrickRange()`, or `jvr.Finest()`, which allows nothing. `levels`: samples are at most `2^levels` slices
+    and pixels apart, 0 ... 5; 0 leaves none out. **Raises** `ValueError` for levels out of range.
+    """
+
+    oracle: AbstractOracle
+    levels: int = eqx.field(static=True)
+
+    def __init__(self, oracle: AbstractOracle = LocalError(), *, levels: int = 3):
+        if not isinstance(oracle, AbstractOracle):
+            raise TypeError(
+                f"oracle must be jvr.LocalError(), jvr.OpacityChange(), jvr.BrickRange() or jvr.Finest(), not {oracle!r}"
+            )
+        if isinstance(levels, bool) or not isinstance(levels, int) or not 0 <= levels <= 5:
+            raise ValueError(f"Slices levels must be a whole number from 0 (every sample) to 5 (32 slices apart), not {levels!r}")
+        self.oracle = oracle
+        self.levels = levels
+
+    @property
+    def explanation(self) -> str:
+        return f"slices, samples up to {2**self.levels} slices and pixels apart where {type(self.oracle).__name__} allows it"
+
+    def render(self, scene: Any, camera: Any, settings: Any) -> "Rendering":
+        from jvr.rendering.adaptive import render_slices
+
+        return render_slices(scene, camera, settings, self)
+
+
 class Refinement(AbstractSampling):
     """Rays far apart where the picture is smooth: first every `tile`-th and `tile / 2`-th pixel, in rows and in columns, then those
     between where interpolation was wrong by more than `tolerance` (`jvr.rendering.refinement`).
@@ -69,6 +103,18 @@ class Refinement(AbstractSampling):
         from jvr.rendering.refinement import render_refined
 
         return render_refined(scene, camera, settings, self)
+
+
+class SliceStats(eqx.Module):
+    """What `Slices` sampled.
+
+    - `samples`: samples of the volume taken on each level of the pyramid, the finest first, `(levels + 1,)`.
+    - `full`: slices between entry and end of each pixel, all pixels together: the samples if none is left out. The finest level
+      may take one more a pixel, behind its exit.
+    """
+
+    samples: Int[Array, "levels"]
+    full: Int[Array, ""]
 
 
 class RefinementStats(eqx.Module):

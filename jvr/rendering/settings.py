@@ -21,7 +21,7 @@ class Settings(eqx.Module):
     - `skipping`: whether rays leap over bricks of the volume that the transfer function leaves empty. The picture is the same to
       rounding; what gradients skip is what has none.
     - `adjoint`: how derivatives are computed: `jvr.Replay()` (reverse mode, default), `jvr.Forward()` or `jvr.Rows()`.
-    - `sampling`: which samples are taken: `jvr.Uniform()` (default: all) or `jvr.Refinement()`.
+    - `sampling`: which samples are taken: `jvr.Uniform()` (default: all), `jvr.Refinement()` or `jvr.Slices()`.
     - `tile`: rays marched at a time. Memory is about 120 bytes a ray; smaller tiles need less and take longer.
 
     **Raises** `ValueError` for values out of range.
@@ -59,7 +59,7 @@ class Settings(eqx.Module):
         if not isinstance(adjoint, AbstractAdjoint):
             raise TypeError(f"adjoint must be jvr.Replay(), jvr.Forward() or jvr.Rows(), not {adjoint!r}")
         if not isinstance(sampling, AbstractSampling):
-            raise TypeError(f"sampling must be jvr.Uniform() or jvr.Refinement(), not {sampling!r}")
+            raise TypeError(f"sampling must be jvr.Uniform(), jvr.Refinement() or jvr.Slices(), not {sampling!r}")
         self.step = float(step)
         self.termination = float(termination)
         self.quadrature = quadrature

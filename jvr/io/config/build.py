@@ -21,11 +21,13 @@ from jvr.io.config.schema import (
     PerspectiveTable,
     RefinementTable,
     RigTable,
+    SlicesTable,
     TransferFile,
     VolumeTable,
 )
 from jvr.io.config.transfers import build_transfer, read_transfer
 from jvr.march.differentiation import Forward, Replay, Rows
+from jvr.march.oracle import BrickRange, Finest, LocalError, OpacityChange
 from jvr.march.quadrature import Midpoint, PreIntegrated
 from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, fibonacci_sphere, look_at, orbit
 from jvr.model.optical import AbsorptionOnly, EmissionAbsorption, EmissionOnly
@@ -33,11 +35,12 @@ from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTransfer, LutTransfer
 from jvr.model.volume import ClippingBox, Nearest, Trilinear, Volume
 from jvr.rendering.image import render
-from jvr.rendering.sampling import AbstractSampling, Refinement, Uniform
+from jvr.rendering.sampling import AbstractSampling, Refinement, Slices, Uniform
 from jvr.rendering.settings import Settings
 
 QUADRATURES = {"midpoint": Midpoint, "pre-integrated": PreIntegrated}
 ADJOINTS = {"replay": Replay, "forward": Forward, "rows": Rows}
+ORACLES = {"local-error": LocalError, "opacity-change": OpacityChange, "brick-range": BrickRange}
 INTERPOLATIONS = {"trilinear": Trilinear, "nearest": Nearest}
 OPTICAL = {"emission-absorption": EmissionAbsorption, "emission-only": EmissionOnly, "absorption-only": AbsorptionOnly}
 READ_KEYWORDS = ("shape", "dtype", "spacing", "origin", "array", "series", "axes", "nan_value")
@@ -147,6 +150,9 @@ def build_fit(config: Config, read_image: Callable[[Path], np.ndarray] | None = 
 def _sampling(table: AnySampling) -> AbstractSampling:
     if isinstance(table, RefinementTable):
         return Refinement(table.tolerance, tile=table.tile)
+    if isinstance(table, SlicesTable):
+        oracle = Finest() if table.oracle == "finest" else ORACLES[table.oracle](table.tolerance)
+        return Slices(oracle, levels=table.levels)
     return Uniform()
 
 

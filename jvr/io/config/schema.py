@@ -254,6 +254,15 @@ class UniformTable(Table):
     kind: Literal["uniform"]
 
 
+class SlicesTable(Table):
+    """`jvr.Slices`."""
+
+    kind: Literal["slices"]
+    oracle: Literal["local-error", "opacity-change", "brick-range", "finest"] = "local-error"
+    tolerance: Annotated[float, number("opacity and radiance of one voxel", 0.0, inner=True)] = 0.01
+    levels: Literal[0, 1, 2, 3, 4, 5] = 3
+
+
 class RefinementTable(Table):
     """`jvr.Refinement`."""
 
@@ -267,7 +276,7 @@ def _sampling(value: Any) -> Any:
     return {"kind": value} if isinstance(value, str) else value
 
 
-AnySampling = Annotated[UniformTable | RefinementTable, Field(discriminator="kind")]
+AnySampling = Annotated[UniformTable | SlicesTable | RefinementTable, Field(discriminator="kind")]
 Sampling = Annotated[AnySampling, BeforeValidator(_sampling)]
 
 

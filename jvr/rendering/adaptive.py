@@ -1,0 +1,151 @@
+"""Pictures from samples that are far apart where a volume allows it, along the view and across it (Kraus, Strengert, Klein and Ertl,
+"Adaptive sampling in three dimensions for volume rendering on GPUs"; `jvr.march.slices` is the loop)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jvr.march.differentiation import Replay
+from jvr.march.oracle import DistanceField, distance_field, thickness
+from jvr.march.quadrature import PreIntegrated
+from jvr.march.slices import NEVER, Lattice, SliceOptions
+from jvr.march.slices import Slices as Sliced
+from jvr.march.slices_adjoint import replay_slices
+from jvr.march.steps import Rays
+from jvr.model.camera import AbstractCamera
+from jvr.model.preintegration import PreIntegratedTable
+from jvr.model.scene import Scene
+from jvr.model.transfer import LinearTransfer, LutTransfer
+from jvr.model.volume import Trilinear
+from jvr.numerics import divide_or_zero
+from jvr.rendering.image import Rendering, RenderStats, composite, enter, one_precision, step_length
+from jvr.rendering.pixels import ImagePlane, image_plane
+from jvr.rendering.sampling import Slices, SliceStats
+from jvr.rendering.settings import Settings
+from jvr.types import Channels, Scalar
+
+# Bricks across which the oracle is asked to look: a picture whose pixels are larger than that is coarser than the volume anyway.
+FARTHEST = 32
+UNIFORM = "leave Settings(sampling=...) at jvr.Uniform()"
+
+
+# Compiled as one program also where it is called with arrays at hand; inside another program it is a part of that.
+@jax.jit
+def render_slices(
+    scene: Scene, camera: AbstractCamera, settings: Settings, sampling: Slices, *, distances: DistanceField | None = None
+) -> Rendering:
+    """Renders `scene` as `camera` sees it, from samples that `sampling` chooses.
+
+    Samples lie on slices `settings.step` voxels apart, the first where the first ray enters: planes for an orthographic camera, spheres
+    around the eye for a perspective one, so that slices are equally far apart along every ray. Where a ray enters and leaves, samples
+    are clamped to the volume. With `levels=0` this is `jvr.render` with `jvr.PreIntegrated()` up to where on each ray the slices lie.
+    The wanted distance is divided by the larger of the distance between slices and the one between pixels, so a step near the size of
+    a pixel saves most.
+
+    **Arguments:** `distances`: placement to use in place of what the oracle says.
+
+    Differentiable in all that `jvr.render` is, in reverse mode. Detached: which samples are taken, and where pixels end. `stats.steps`
+    counts segments, `stats.sampling` is a `SliceStats`. `settings.tile` and `skipping` play no part: all pixels are in one batch. Memory:
+    about 200 bytes a pixel; with derivatives another 100 for each of the `2^levels` slices of a block. Traceable.
+
+    **Raises** `ValueError` for what it cannot render: nearest-neighbour volumes, transfer functions that are not tables, cameras other
+    than jvr's own, adjoints other than `jvr.Replay()`.
+    """
+    scene, camera = one_precision(scene, camera)
+    table = _table(scene, settings)
+    plane, dt = image_plane(camera), step_length(scene, settings)
+    period = 2**sampling.levels
+    width, height = (-(-n // period) * period for n in (camera.width, camera.height))
+    options = SliceOptions(sampling.levels, width, height, settings.termination, _segment)
+    lattice, finest, t_in = _lattice(scene, camera, plane, options, dt)
+    if distances is None:
+        reach = _reach(scene, sampling, options, lattice, dt)
+        distances = distance_field(sampling.oracle, scene.volume, table, scene.optical, reach)
+
+    parts = settings.quadrature.parts if isinstance(settings.quadrature, PreIntegrated) else 1
+    shading = (PreIntegratedTable(table, parts), scene.optical)
+    gathered, ended, samples = replay_slices(options, Sliced(scene.volume, shading, lattice, dt, distances))
+
+    rgb, alpha = composite(scene, gathered, finest.length)
+    weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
+    depth = jnp.where(alpha > 0, t_in + divide_or_zero(weighted, alpha), 0.0)
+    crop = lambda x: x.reshape(options.shape(0))[1 : camera.height + 1, 1 : camera.width + 1]
+    rgb, alpha, depth, steps = jax.tree.map(crop, (rgb, alpha, depth, gathered.steps))
+    full = jnp.where(lattice.last >= 0, jnp.minimum(ended, lattice.last) - lattice.first + 1, 0)
+    return Rendering(
+        jnp.stack(rgb, axis=-1), alpha, depth, RenderStats(steps, SliceStats(samples, jnp.sum(full, dtype=jnp.int32)))
+    )
+
+
+def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
+    """The transfer function; says what cannot be rendered, rather than leaving it out."""
+    if not isinstance(scene.volume.interpolation, Trilinear):
+        name = type(scene.volume.interpolation).__name__
+        raise ValueError(f"jvr.Slices() interpolates between samples, which {name}() volumes do not allow: {UNIFORM}")
+    if not isinstance(settings.adjoint, Replay):
+        raise ValueError(
+            f"jvr.Slices() needs Settings(adjoint=jvr.Replay()), not jvr.{type(settings.adjoint).__name__}(): {UNIFORM}"
+        )
+    if not isinstance(scene.transfer, LinearTransfer | LutTransfer):
+        name = type(scene.transfer).__name__
+        raise ValueError(
+            f"jvr.Slices() pre-integrates a LinearTransfer or a LutTransfer, not a {name}: tabulate it as a LutTransfer"
+        )
+    return scene.transfer
+
+
+def _segment(shading: Any, lanes: tuple[Array, Array, Array]) -> tuple[Channels, Channels]:
+    """Radiance and optical depth of segments along which the scalar changes linearly."""
+    table, optical = shading
+    return jax.vmap(lambda front, back, length: table.segment(optical, front, back, length))(*lanes)
+
+
+def _reach(scene: Scene, sampling: Slices, options: SliceOptions, lattice: Lattice, dt: Scalar) -> Scalar:
+    """How far the oracle has to look for a picture to make use of it."""
+    farthest = jnp.maximum(jnp.max(lattice.last), 0)
+    largest = jnp.maximum(dt, lattice.unit + farthest * lattice.unit_slope)
+    across = thickness(scene.volume, sampling.oracle.brick)
+    # A sample with twice the largest distance is the coarsest there is.
+    return jnp.minimum(2 * options.period * largest, FARTHEST * jnp.minimum(jnp.minimum(across[0], across[1]), across[2]))
+
+
+def _lattice(
+    scene: Scene, camera: AbstractCamera, plane: ImagePlane, options: SliceOptions, dt: Scalar
+) -> tuple[Lattice, Rays, Float[Array, "pixels"]]:
+    """Where slices cut rays; the rays of the finest level, ring and padding included, and the distance from the eye to their entry."""
+    levels = [_level(scene, plane, options, level) for level in range(options.levels + 1)]
+    column, row, finest, t_in, _ = levels[0]
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (finest.length > 0)
+    far = jnp.finfo(dt.dtype).max
+    nearest = jnp.min(jnp.where(inside, t_in, far))
+    nearest = jnp.where(nearest < far, nearest, 0.0)
+
+    rays = []
+    for _, _, level, t, whole in levels:
+        hits = level.length > 0
+        rows = [jnp.where(hits, a, b) for a, b in zip((*level.entry, *level.direction), whole, strict=True)]
+        # On slice k the distance from the entry is u = (nearest - t) + k dt: the large numbers cancel once, not on every slice.
+        rays.append(jnp.stack([*rows, nearest - jnp.where(hits, t, 0.0), jnp.where(hits, level.length, far)], axis=1))
+    slice_of = lambda u: jax.lax.stop_gradient((u - nearest) / dt)
+    first, last = jnp.floor(slice_of(t_in)).astype(jnp.int32), jnp.ceil(slice_of(t_in + finest.length)).astype(jnp.int32)
+    apart, spread = plane.size
+    unit, unit_slope = jax.lax.stop_gradient((apart + spread * nearest, spread * dt))
+    lattice = Lattice(tuple(rays), jnp.where(inside, first, NEVER), jnp.where(inside, last, -1), unit, unit_slope)
+    return lattice, finest, t_in
+
+
+def _level(
+    scene: Scene, plane: ImagePlane, options: SliceOptions, level: int
+) -> tuple[Array, Array, Rays, Array, tuple[Array, ...]]:
+    """Column and row of each pixel of a level in units of the finest, its ray inside the volume, the distance to its entry, and the
+    whole ray in grid coordinates: start, then direction."""
+    height, width = options.shape(level)
+    # Pixel x of a level is centred on 2^l (x + 1/2) - 1/2 (figure 5 of the paper); the ring begins at -1.
+    place = lambda n: 2**level * (jnp.arange(n) - 0.5) - 0.5
+    row, column = (x.reshape(-1) for x in jnp.meshgrid(place(height), place(width), indexing="ij"))
+    origin, direction = plane.rays(column, row)
+    rays, t_in = enter(scene, origin, direction)
+    along = scene.volume.grid_from_world(direction, direction=True)
+    return column, row, rays, t_in, (*scene.volume.grid_from_world(origin), *along)
