@@ -28,10 +28,14 @@ def sweep(quick: bool) -> dict[str, list[jvr.Settings]]:
     """Settings by the knob that they turn, the others at their defaults."""
     steps = (0.5, 1.0, 2.0) if quick else (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
     terminations = (1e-2,) if quick else (0.0, 1e-3, 1e-2, 1e-1)
+    tolerances = (1e-2,) if quick else (1e-3, 1e-2)
     return {
         "step": [jvr.Settings(step) for step in steps],
         "termination": [jvr.Settings(0.5, termination=t) for t in terminations],
         "no skipping": [jvr.Settings(step, skipping=False) for step in steps[1:3]],
+        "pre-integration": [jvr.Settings(step, quadrature=jvr.PreIntegrated()) for step in steps[1:]],
+        "refinement": [jvr.Settings(0.5, sampling=jvr.Refinement(t)) for t in tolerances],
+        "slices": [jvr.Settings(1.0, sampling=jvr.Slices(jvr.LocalError(t))) for t in tolerances],
     }
 
 
@@ -70,13 +74,16 @@ def main() -> None:
         name = f"{described.name} ({described.data})"
         print(f"\n{name}: {'x'.join(map(str, scene.volume.shape))} {scene.volume.values.dtype}")
         rows = measured(name, scene, camera, sweep(arguments.quick), gradient=False)
+        if scene.volume.values.dtype != np.uint8:
+            rows += rounded(name, scene, camera, "8 bits", with_voxels_of(scene, np.uint8))
         if scene.volume.values.dtype == np.float32:
-            for dtype in (np.uint8, np.uint16):
-                rows += rounded(name, scene, camera, dtype)
+            rows += rounded(name, scene, camera, "16 bits", with_voxels_of(scene, np.uint16))
+        packed = dataclasses.replace(scene, volume=scene.volume.packed().bricked())
+        rows += rounded(name, scene, camera, "8 bits, packed", packed)
         show(rows)
         pictures += rows
-        steps = {"step": sweep(arguments.quick)["step"]}
-        gradients += measured(name, scene, camera, steps, gradient=True)
+        knobs = {knob: some for knob, some in sweep(arguments.quick).items() if knob in ("step", "termination")}
+        gradients += measured(name, scene, camera, knobs, gradient=True)
     result = {"machine": machine(), "pictures": pictures, "gradients": gradients}
     if arguments.json:
         Path(arguments.json).write_text(json.dumps(result, indent=2) + "\n")
@@ -84,13 +91,11 @@ def main() -> None:
         figure(pictures, gradients, arguments.figure)
 
 
-def rounded(name: str, scene: jvr.Scene, camera: jvr.PerspectiveCamera, dtype: Any) -> list[dict[str, Any]]:
+def rounded(name: str, scene: jvr.Scene, camera: jvr.PerspectiveCamera, knob: str, stored: jvr.Scene) -> list[dict[str, Any]]:
     """The picture of a volume stored in fewer bits, against the reference of the one it was rounded from."""
     settings = jvr.Settings(0.5)
-    picture = jax.jit(jvr.render)
-    stored = with_voxels_of(scene, dtype)
-    (row,) = measured(name, stored, camera, {f"voxels {np.dtype(dtype).name}": [settings]}, gradient=False)
-    difference = np.asarray(picture(stored, camera, settings).rgb) - np.asarray(picture(scene, camera, settings).rgb)
+    (row,) = measured(name, stored, camera, {knob: [settings]}, gradient=False)
+    difference = np.asarray(jvr.render(stored, camera, settings).rgb) - np.asarray(jvr.render(scene, camera, settings).rgb)
     # Its own reference does not know what rounding took away: both errors together.
     row["rmse"] = float(np.hypot(row["rmse"], np.sqrt(np.mean(difference**2))))
     row["largest"] += float(np.abs(difference).max())
@@ -135,8 +140,8 @@ def figure(pictures: list[dict[str, Any]], gradients: list[dict[str, Any]], path
         front = np.array(pareto([(row["seconds"], row["rmse"]) for row in rows]))
         panel.plot(1e3 * front[:, 0], front[:, 1], "-", color="0.4", linewidth=1, zorder=0, label="Pareto front")
         of_gradient = [row for row in gradients if row["scene"] == name]
-        panel.plot([1e3 * r["seconds"] for r in of_gradient], [r["gradient_error"] for r in of_gradient], "kx--", markersize=4,
-                   linewidth=0.7, label="gradient (relative)")  # fmt: skip
+        panel.plot([1e3 * r["seconds"] for r in of_gradient], [r["gradient_error"] for r in of_gradient], "kx", markersize=4,
+                   label="gradient (relative)")  # fmt: skip
         panel.set(title=name, xscale="log", yscale="log", xlabel="milliseconds", ylabel="error")
         panel.xaxis.set_major_formatter("{x:g}")
         panel.xaxis.set_minor_formatter(NullFormatter())
