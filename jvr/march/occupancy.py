@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from jvr.march.steps import Rays
 from jvr.model.bricks import Bricks
 from jvr.model.transfer import AbstractTransfer
+from jvr.numerics import computed_once
 from jvr.types import Scalar
 
 # Radii of the empty cubes that are told apart, in bricks. Each is the last one plus at most itself plus one (see `_reach`).
@@ -67,10 +68,13 @@ def _reach(empty: Bool[Array, "bx by bz"]) -> UInt8[Array, "bx by bz"]:
 
     A cube of radius `r + s` is the union of cubes of radius `r` around bricks `s` apart, as long as `s <= 2 r + 1`.
     """
+    # Else each of the two bricks that an erosion looks at is classified anew; where none is empty, zeros say the same.
+    empty = computed_once(empty, empty)
     reach = empty.astype(jnp.uint8)
     for radius, larger in itertools.pairwise(RADII):
         for axis in range(3):
             empty = _erode(empty, axis, larger - radius)
+        empty = computed_once(empty, empty)
         reach = jnp.where(empty, jnp.uint8(larger + 1), reach)
     return reach
 
