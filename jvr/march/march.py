@@ -22,6 +22,9 @@ from jvr.model.transfer import Classified
 from jvr.numerics import computed_once, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
+# Leaps before a ray is started.
+FIRST_LEAPS = 4
+
 
 class AbstractField(eqx.Module):
     """What is resampled along rays, the scalar `s`; its arrays may be large."""
@@ -137,14 +140,19 @@ def integrate(
     """What every ray gathered, and where a replay will need it, what that starts from."""
     emits, absorbs = channel_counts(medium, rays, dt)
 
-    def start(lanes: Lanes) -> Progress:
+    def start(inputs: tuple[Lanes, Int[Array, "rays"]]) -> Progress:
+        lanes, following = inputs
         zero = jnp.zeros_like(lanes.rays.length)
         blank = (zero,) * absorbs
         sums = Sums((zero,) * emits, (zero,) * emits, blank, blank, blank * options.distance)
         none = jnp.zeros_like(lanes.segments)
-        return Progress(sums, none, none, blank * for_replay, (none,) * absorbs * for_replay)
+        return Progress(sums, following, none, blank * for_replay, (none,) * absorbs * for_replay)
 
-    def advance(lanes: Lanes, progress: Progress, _: None) -> tuple[Progress, None]:
+    def alive(inputs: tuple[Lanes, Int[Array, "rays"]], progress: Progress) -> Bool[Array, "rays"]:
+        return is_alive(options, inputs[0], progress)
+
+    def advance(inputs: tuple[Lanes, Int[Array, "rays"]], progress: Progress, _: None) -> tuple[Progress, None]:
+        lanes, _ = inputs
         k = jnp.where(is_alive(options, lanes, progress), leap(medium, lanes, dt, progress.following), progress.following)
         leapt, progress = k > progress.following, progress._replace(following=k)
         alive = is_alive(options, lanes, progress)
@@ -159,8 +167,15 @@ def integrate(
         return marched(progress), noted
 
     lanes = lanes_of(rays, dt)
-    alive = functools.partial(is_alive, options)
-    return pooled_while(alive, advance, start, finish, lanes, None, lanes.segments)[0]
+    first = first_visible(medium, lanes, dt)
+    work = lanes.segments - first
+    gathered, noted = pooled_while(alive, advance, start, finish, (lanes, first), None, work)[0]
+    if noted is not None:
+        # Rays without work were not started; a replay that skips nothing still has all of their segments to look at.
+        blank = work == 0
+        last = tuple(jnp.where(blank, lanes.segments - 1, x) for x in noted.last)
+        noted = noted._replace(following=jnp.where(blank, lanes.segments, noted.following), last=last)
+    return gathered, noted
 
 
 def note_front(progress: Progress, moved: Bool[Array, "rays"], k: Int[Array, "rays"]):
@@ -192,6 +207,15 @@ def leap(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"]) -> Int
     within = len(medium.shader.places) > 1
     first = u - extent / 2 if within else u
     return jnp.minimum(k + medium.occupancy.leap(lanes.rays, first, dt, within=within), lanes.segments)
+
+
+def first_visible(medium: Medium, lanes: Lanes, dt: Scalar) -> Int[Array, "rays"]:
+    """The segment that each ray starts with: a few leaps on from its entry. Most of the rays that see nothing end here, and what is
+    left of the others says better how long they will take."""
+    first = jnp.zeros_like(lanes.segments)
+    if medium.occupancy is None:
+        return first
+    return jax.lax.fori_loop(0, FIRST_LEAPS, lambda _, k: leap(medium, lanes, dt, k), first)
 
 
 def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
