@@ -99,7 +99,7 @@ def figure(tables: dict[str, list[dict[str, Any]]], pictures: dict[str, list[tup
             panel.imshow(np.clip(rgb, 0, 1) ** (1 / 2.2))
             panel.set_title(title, fontsize=9)
             panel.set_axis_off()
-    row[0].legend(fontsize=7)
+    panels[-1, 0].legend(fontsize=7)
     drawing.savefig(path, dpi=110)
 
 

@@ -27,10 +27,10 @@ class Selection(NamedTuple):
     through: Int[Array, "words"]
 
     @property
-    def count(self) -> Int[Array, ""]:
+    def number(self) -> Int[Array, ""]:
         return self.through[-1]
 
-    def index(self, k: Int[Array, "n"]) -> Int[Array, "n"]:
+    def element(self, k: Int[Array, "n"]) -> Int[Array, "n"]:
         """The index of the `k`-th selected element, in increasing order; anything where there are not so many."""
         word = jnp.searchsorted(self.through, k, side="right", method="scan_unrolled")
         word = jnp.minimum(word, self.words.size - 1).astype(jnp.int32)
@@ -67,18 +67,18 @@ def for_each(
     lanes = jnp.arange(min(BLOCK, mask.size), dtype=jnp.int32)
 
     def at(done: Int[Array, ""]) -> Int[Array, "lanes"]:
-        return jnp.where(done + lanes < selection.count, selection.index(done + lanes), 0)
+        return jnp.where(done + lanes < selection.number, selection.element(done + lanes), 0)
 
     def step(state: Any) -> Any:
         done, index, following, lanes_read, carry = state
-        carry = body(index, done + lanes < selection.count, lanes_read, carry)
+        carry = body(index, done + lanes < selection.number, lanes_read, carry)
         return done + lanes.size, following, at(done + 2 * lanes.size), read(following), carry
 
     # Indices are found two blocks ahead and read from one ahead: the compiler does not fuse across iterations of a loop, and would
     # otherwise repeat the search in every single read.
     first = at(jnp.int32(0))
     start = (jnp.int32(0), first, at(jnp.int32(lanes.size)), read(first), carry)
-    return jax.lax.while_loop(lambda state: state[0] < selection.count, step, start)[-1]
+    return jax.lax.while_loop(lambda state: state[0] < selection.number, step, start)[-1]
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))

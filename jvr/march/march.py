@@ -152,7 +152,7 @@ def integrate(
         return is_alive(options, inputs[0], progress)
 
     def advance(inputs: tuple[Lanes, Int[Array, "rays"]], progress: Progress, _: None) -> tuple[Progress, None]:
-        lanes, _ = inputs
+        lanes = inputs[0]
         k = jnp.where(is_alive(options, lanes, progress), leap(medium, lanes, dt, progress.following), progress.following)
         leapt, progress = k > progress.following, progress._replace(following=k)
         alive = is_alive(options, lanes, progress)

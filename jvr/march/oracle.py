@@ -42,7 +42,7 @@ class DistanceField(eqx.Module):
 class AbstractOracle(eqx.Module):
     """Where samples may be far apart. `brick`: voxels along an edge of the bricks that are looked at."""
 
-    brick: eqx.AbstractClassVar[int]
+    brick: ClassVar[int]
 
     @abc.abstractmethod
     def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:

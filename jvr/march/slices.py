@@ -155,7 +155,8 @@ def take_block(
         pyramid, visited, samples = take_slice(options, slices, ended, base + r, pyramid, taps)
         mask, s = visited & begun, pyramid[0].s
         u0, u1 = (distance(lattice.rays[0], k, slices.dt) for k in (k_before, (base + r).astype(blank.dtype)))
-        emitted, dtau = map_selected(options.segment, mask, slices.shading, (before, s, u1 - u0))
+        added: Any = map_selected(options.segment, mask, slices.shading, (before, s, u1 - u0))
+        emitted, dtau = added
         weights = opacity((jnp.ones_like(blank),) * absorbs, dtau)
         emitted = (*emitted, *(a * (u0 + u1) / 2 for a in weights))
         clear = tuple(jnp.exp(-tau) for tau in gathered.dtau)

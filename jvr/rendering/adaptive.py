@@ -66,7 +66,8 @@ def render_slices(
 
     parts = settings.quadrature.parts if isinstance(settings.quadrature, PreIntegrated) else 1
     shading = (PreIntegratedTable(table, parts), scene.optical)
-    gathered, ended, samples = replay_slices(options, Sliced(scene.volume, shading, lattice, dt, distances))
+    marched: Any = replay_slices(options, Sliced(scene.volume, shading, lattice, dt, distances))
+    gathered, ended, samples = marched
 
     rgb, alpha = composite(scene, gathered, finest.length)
     weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
