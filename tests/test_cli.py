@@ -186,7 +186,9 @@ def test_an_interrupted_fit_goes_on_to_the_same_answer(tmp_path, capfd, monkeypa
     halves = json.loads(capfd.readouterr().out)
     assert len(halves["history"]) == len(whole["history"])
     assert [h["loss"] for h in halves["history"]] == [h["loss"] for h in whole["history"]]
-    assert (tmp_path / "halves/transfer.toml").read_text() == (tmp_path / "whole/transfer.toml").read_text()
+    assert (tmp_path / "halves/transfer.toml").read_text(encoding="utf-8") == (tmp_path / "whole/transfer.toml").read_text(
+        encoding="utf-8"
+    )
 
     _folder_of_a_fit(tmp_path / "whole", whole)
     before = snapshot(tmp_path)
@@ -201,8 +203,8 @@ def _folder_of_a_fit(folder, printed):
     views = [f"{kind}_{view}" for kind in ("target", "fitted", "difference") for view in ("00", "01", "held_out_00")]
     assert {f"{view}{ending}" for view in views for ending in (".exr", ".png")} <= names
     assert not [name for name in names if name.endswith(".part")]
-    assert "jvr fit fit.toml -o whole" in (folder / printed["page"]).read_text()
-    report = json.loads((folder / "result.json").read_text())
+    assert "jvr fit fit.toml -o whole" in (folder / printed["page"]).read_text(encoding="utf-8")
+    report = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     assert report == printed
     assert report["views"]["mean_psnr"] > report["history"][0]["psnr"]
     assert report["settings"]["step"] == 1.0
@@ -246,7 +248,7 @@ def test_an_error_of_our_own_is_not_taken_for_bad_input(monkeypatch):
 def test_the_installed_command_starts_and_refuses(tmp_path):
     environment = {**os.environ, "JVR_CACHE": "0"}
     command = [sys.executable, "-c", "from jvr.cli import main; main()", "render", "other/no.toml"]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60)
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", env=environment, timeout=60)
     assert done.returncode == 2
     assert done.stderr == "jvr: other/no.toml: no such file\n"
 
@@ -269,9 +271,13 @@ def test_an_installed_wheel_has_the_demo(tmp_path):
         "import jvr; from jvr.cli.fit import demo_config; print(demo_config()); from jvr.cli import run; run(['demo', '--help'])"
     )
     environment = {**os.environ, "PYTHONPATH": str(installed), "JVR_CACHE": "0"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, encoding="utf-8", env=environment, check=True, timeout=60
+    )
     assert Path(done.stdout.splitlines()[0]) == installed / "jvr" / "configs" / "demo.toml"
-    assert (installed / "jvr" / "configs" / "demo.toml").read_text() == (repository / "configs" / "demo.toml").read_text()
+    assert (installed / "jvr" / "configs" / "demo.toml").read_text(encoding="utf-8") == (
+        repository / "configs" / "demo.toml"
+    ).read_text(encoding="utf-8")
     assert "jvr demo" in done.stdout
     # A package that the wheel forgets is still there for everyone who works in the repository.
     modules = lambda root: {path.relative_to(root).as_posix() for path in (root / "jvr").rglob("*.py")}

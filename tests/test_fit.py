@@ -353,17 +353,9 @@ def test_held_out_views_are_scored():
     assert 0.99 < similarity <= 1
 
 
-def test_held_out_views_are_traced_once_for_each_size(monkeypatch):
-    sizes = []
-
-    def counted(scene, camera, settings):
-        sizes.append((camera.width, camera.height))
-        return jvr.render(scene, camera, settings)
-
-    monkeypatch.setattr("jvr.fitting.fit.render", counted)
+def test_held_out_views_may_differ_in_size():
     wide = jvr.PerspectiveCamera(CAMERAS[0].world_from_camera, 30.0, 9, 8)
     result = fit(max_steps=1, held_out=((*CAMERAS, wide), [*IMAGES, np.zeros((8, 9, 3))]), exposure=True)
-    assert sizes == [(16, 15), (9, 8)]
     assert len(result.stats.held_out) == 4
 
 
