@@ -84,6 +84,8 @@ def main() -> None:
         pictures += rows
         knobs = {knob: some for knob, some in sweep(arguments.quick).items() if knob in ("step", "termination")}
         gradients += measured(name, scene, camera, knobs, gradient=True)
+        # The programs of all scenes together exceed what a process may map into memory.
+        jax.clear_caches()
         # After each scene, so that a run that is stopped leaves what it has.
         result = {"machine": machine(), "pictures": pictures, "gradients": gradients}
         if arguments.json:
@@ -146,7 +148,7 @@ def figure(pictures: list[dict[str, Any]], gradients: list[dict[str, Any]], path
         panel.set(title=name, xscale="log", yscale="log", xlabel="milliseconds", ylabel="error")
         panel.xaxis.set_major_formatter("{x:g}")
         panel.xaxis.set_minor_formatter(NullFormatter())
-    drawing.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(knobs) + 2, frameon=False)
+    drawing.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
     for panel in panels[len(names) :]:
         panel.set_axis_off()
     drawing.savefig(path, dpi=130)
