@@ -12,7 +12,7 @@ State = TypeVar("State")
 Shared = TypeVar("Shared")
 Results = TypeVar("Results")
 
-# Lanes in the pool: enough for every core to have work at each step, few enough for their state to stay in the cache.
+# Lanes in the pool: enough to outweigh what it costs to start an operation, few enough for their state to stay in the cache.
 POOL = 6144
 # The share of lanes that may idle before they are filled again.
 IDLE = 0.25
@@ -75,9 +75,10 @@ def pooled_while(
 
     carry = (own, state, shared, index, jnp.int32(POOL), results)
     own, state, shared, index, _, results = jax.lax.while_loop(filling, drain_and_fill, carry)
-    # Lanes that are not alive are done and written; one of them fills up the smaller pool, and is written again.
+    # Lanes that are not alive are done and written; one of them fills up the smaller pool, and is written again. Where all are alive,
+    # in a pool no larger than the smaller one, none may be taken twice: what it adds to `shared` would count twice.
     living = alive(own, state)
-    lanes = jnp.nonzero(living, size=TAIL, fill_value=jnp.argmin(living))[0]
+    lanes = jnp.nonzero(living, size=min(TAIL, POOL), fill_value=jnp.argmin(living))[0]
     index, state = index[lanes], jax.tree.map(lambda x: x[lanes], state)
     own = take(index)
     state, shared = jax.lax.while_loop(lambda c: jnp.any(alive(own, c[0])), lambda c: advance(own, *c), (state, shared))

@@ -25,7 +25,7 @@ from jvr.types import Scalar, Triple
 
 
 class DistanceField(eqx.Module):
-    """The distance that is wanted between samples, a world length for each brick of `size` voxels an edge edge."""
+    """The distance that is wanted between samples, a world length for each brick of `size` voxels an edge."""
 
     distance: Float[Array, "bx by bz"]
     brick: int = eqx.field(static=True)

@@ -1,5 +1,7 @@
 """How a segment is integrated: the choices that `Settings(quadrature=...)` takes."""
 
+import abc
+
 import equinox as eqx
 
 
@@ -7,9 +9,9 @@ class AbstractQuadrature(eqx.Module):
     """A rule for one segment. Static, without arrays."""
 
     @property
+    @abc.abstractmethod
     def explanation(self) -> str:
         """What the rule does, for `jvr.plan`."""
-        raise NotImplementedError
 
 
 class Midpoint(AbstractQuadrature):

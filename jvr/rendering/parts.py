@@ -37,11 +37,10 @@ def in_parts(function: Callable[[Int[Array, "rays"]], Any], height: int, width: 
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error) or rows == 1:
                 raise
-            rows = -(-rows // 2)
             if not warned:
-                advice = f"going on with fewer; Settings(tile={rows * width}) starts there"
-                warnings.warn(f"out of memory with {2 * rows * width} rays at a time: {advice}", RuntimeWarning, stacklevel=3)
-            warned = True
+                advice = "going on with half as many; Settings(tile=...) starts with fewer"
+                warnings.warn(f"out of memory with {rows * width} rays at a time: {advice}", RuntimeWarning, stacklevel=3)
+            rows, warned = -(-rows // 2), True
 
 
 def _in_parts(function: Callable[[Int[Array, "rays"]], Any], height: int, width: int, parts: int) -> Any:
