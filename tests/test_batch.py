@@ -54,3 +54,13 @@ def test_edges(size, fill):
     results, total = run(work)
     np.testing.assert_array_equal(results["steps"], work)
     assert total == work.sum()
+
+
+def test_a_pool_smaller_than_its_tail_counts_no_lane_twice(monkeypatch):
+    """The queue is empty while all lanes are alive, so none of them can fill up the smaller pool."""
+    monkeypatch.setattr(batch, "TAIL", 100)
+    jax.clear_caches()
+    work = np.repeat(np.array([50, 10, 5], np.int32), [48, 16, 16])
+    results, total = run(work)
+    np.testing.assert_array_equal(results["steps"], work)
+    assert total == work.sum()
