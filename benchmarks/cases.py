@@ -106,12 +106,13 @@ def fitting() -> dict[str, Any]:
     observations = observe(start, cameras, images, None, settings, chunk)
     kept = keep_samples(start, observations, settings, chunk, 2**31)
     assert kept is not None
-    through, rays = observed_medium(start, kept[1], kept[0])
+    through, rays = observed_medium(start, kept[1], kept[0], settings)
     plain = jax.jit(yardsticks.kept_march)
     dt = step_length(start, settings)
     jax.block_until_ready(plain(through, rays, dt))
     unknowns = lambda s: (s.transfer.rgb, s.transfer.sigma_t)
-    run = lambda: jvr.fit(start, cameras, images, settings=settings, unknowns=unknowns, progress=False)
+    run = lambda settings=settings: jvr.fit(start, cameras, images, settings=settings, unknowns=unknowns, progress=False)
+    seconds_to_60 = lambda result: next((entry.seconds for entry in result.history if entry.psnr >= 60), float("nan"))
     result = run()
     evaluations, to_60 = [], []
     for _ in range(3):
@@ -120,7 +121,13 @@ def fitting() -> dict[str, Any]:
             jax.block_until_ready(plain(through, rays, dt))
         evaluations.append((time.perf_counter() - began) / 5)
         result = run()
-        to_60.append(next((entry.seconds for entry in result.history if entry.psnr >= 60), float("nan")))
+        to_60.append(seconds_to_60(result))
+    less = {}
+    for negligible in (1e-3, 1e-2):
+        bounded = jvr.Settings(settings.step, termination=settings.termination, negligible=negligible)
+        run(bounded)
+        short = run(bounded)
+        less[str(negligible)] = {"seconds_to_60_db": seconds_to_60(short), "psnr_at_convergence": short.history[-1].psnr}
     return {
         "psnr_at_convergence": result.history[-1].psnr,
         "iterations": len(result.history),
@@ -128,6 +135,7 @@ def fitting() -> dict[str, Any]:
         "plain_evaluation_seconds": statistics.median(evaluations),
         "evaluations_to_60_db": statistics.median(a / b for a, b in zip(to_60, evaluations, strict=True)),
         "kept_bytes": result.stats.kept_bytes,
+        "negligible": less,
     }
 
 

@@ -138,6 +138,51 @@ def test_gradient_is_the_same(of, x64):
             assert np.any(on[0].transfer.sigma_t[transfer.sigma_t == 0] != 0)
 
 
+def faint_scene(rng):
+    """Tenuous matter around dense blobs."""
+    volume, transfer = scene_of(rng, (17, 12, 21), float, 1.0)
+    sigma_t = np.where(np.arange(transfer.sigma_t.size) < 4, rng.choice([0.0, 1e-7, 1e-5], 12), 0.3)
+    transfer = eqx.tree_at(lambda t: t.sigma_t, transfer, jnp.asarray(sigma_t))
+    return jvr.Scene(volume.bricked(1), transfer, background=(0.1, 0.2, 0.3)), perspective(volume, 8, 6)
+
+
+@pytest.mark.parametrize("negligible", [1e-3, 1e-2])
+def test_what_is_negligible_stays_below_its_bound(negligible, x64):
+    """In every pixel, and in every entry of its derivative in the logarithms of the extinctions, by both ways to take it."""
+
+    def pixels(sigma_t, scene, camera, settings):
+        scene = eqx.tree_at(lambda s: s.transfer.sigma_t, scene, sigma_t)
+        return jvr.render(scene, camera, settings).rgb
+
+    squares = lambda *arguments: jnp.sum(jnp.square(pixels(*arguments)))
+    jacobian, forward, reverse = (
+        jax.jit(f, static_argnums=3) for f in (jax.jacfwd(pixels), jax.jacfwd(squares), jax.grad(squares))
+    )
+    saved = 0
+    for seed in range(4):
+        scene, camera = faint_scene(np.random.default_rng(seed))
+        sigma_t = scene.transfer.sigma_t
+        settings = [jvr.Settings(0.6, termination=0, negligible=n, adjoint=jvr.Forward()) for n in (0.0, negligible)]
+        exact, kept = (jvr.render(scene, camera, s) for s in settings)
+        assert np.abs(exact.rgb - kept.rgb).max() <= negligible
+        saved += int(exact.stats.samples) - int(kept.stats.samples)
+        of_exact, of_kept = (sigma_t * jacobian(sigma_t, scene, camera, s) for s in settings)
+        assert np.abs(of_exact - of_kept).max() <= 2 * negligible
+        backwards = reverse(sigma_t, scene, camera, jvr.Settings(0.6, termination=0, negligible=negligible))
+        np.testing.assert_allclose(backwards, forward(sigma_t, scene, camera, settings[1]), rtol=1e-9, atol=1e-12)
+    assert saved > 0
+
+
+def test_fit_leaves_out_what_is_negligible(x64):
+    """Rows of the table leap as gradients do: both give the same normal equations, and the fit still finds its target."""
+    scene, camera = faint_scene(np.random.default_rng(0))
+    target = jvr.render(scene, camera).rgb
+    start = eqx.tree_at(lambda s: s.transfer.rgb, scene, jnp.full_like(scene.transfer.rgb, 0.5))
+    result = jvr.fit(start, [camera], [target], unknowns=lambda s: s.transfer.rgb, settings=jvr.Settings(negligible=1e-3))
+    error = np.sqrt(np.mean(np.square(jvr.render(result.scene, camera).rgb - target)))
+    assert 1e-9 < error <= 1e-3
+
+
 def test_empty_space_is_not_sampled():
     """A ball in a large empty box: samples are taken near the ball only, and the picture is the same to 1e-6."""
     grid = np.stack(np.meshgrid(*[np.arange(65.0) - 32] * 3, indexing="ij"))

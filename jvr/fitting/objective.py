@@ -21,6 +21,7 @@ from jvr.march.rows import TableRows, table_rows
 from jvr.model.camera import AbstractCamera
 from jvr.model.transfer import AbstractTable
 from jvr.rendering.image import composite, step_length, trace
+from jvr.rendering.plan import occupancy
 from jvr.rendering.settings import Settings
 from jvr.types import Scalar, Triple
 
@@ -89,7 +90,7 @@ def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations
 
 def residual(problem: Problem, model: Exposed, piece: Observations, adjoint: AbstractAdjoint = Replay()) -> Triple:
     """Rendered minus target in each channel, differentiable in the mode of `adjoint`."""
-    medium, rays = observed_medium(model.scene, piece, problem.samples)
+    medium, rays = observed_medium(model.scene, piece, problem.samples, problem.settings)
     options = MarchOptions(problem.settings.termination, distance=False)
     gathered = adjoint.march(options, medium, rays, step_length(model.scene, problem.settings))
     colours = predict(problem, model, gathered, rays.length)
@@ -105,7 +106,9 @@ def image_value(
     settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
     losses = []
     for camera, target in zip(cameras, images, strict=True):
-        gathered, rays, _ = trace(model.scene, camera, settings, jnp.arange(camera.width * camera.height, dtype=jnp.int32))
+        where = occupancy(model.scene, settings) if settings.negligible else None
+        pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
+        gathered, rays, _ = trace(model.scene, camera, settings, pixels, where=where)
         rendered = jnp.stack(predict(problem, model, gathered, rays.length), axis=-1).reshape(target.shape)
         losses.append(problem.loss.image(rendered, target))
     return jnp.mean(jnp.stack(losses)) + prior(problem, model)
@@ -171,7 +174,7 @@ def _jacobian(problem: Problem, values: Float[Array, "unknowns"], piece: Observa
     unknowns = problem.unknowns
     model = unknowns.insert(problem.model, unknowns.split(values, problem.model))
     entries, outer, inner = _kinds(problem)
-    medium, rays = observed_medium(model.scene, piece, problem.samples)
+    medium, rays = observed_medium(model.scene, piece, problem.samples, problem.settings)
     options = MarchOptions(problem.settings.termination, distance=False)
     dt = step_length(model.scene, problem.settings)
     blocks: list[Blocks] = [[], [], []]
@@ -191,7 +194,7 @@ def _jacobian(problem: Problem, values: Float[Array, "unknowns"], piece: Observa
 
         def of_inner(part: Array) -> Triple:
             changed = replace(columns, part)
-            medium, rays = observed_medium(changed.scene, piece, problem.samples)
+            medium, rays = observed_medium(changed.scene, piece, problem.samples, problem.settings)
             gathered = Forward().march(options, medium, rays, step_length(changed.scene, problem.settings))
             return predict(problem, changed, gathered, rays.length)
 

@@ -16,7 +16,7 @@ from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import enter, step_length
-from jvr.rendering.plan import medium
+from jvr.rendering.plan import medium, occupancy
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
 from jvr.types import Triple
@@ -148,10 +148,11 @@ def keep_samples(
     return Samples(jnp.asarray(stored), low, scale, chunk), kept
 
 
-def observed_medium(scene: Scene, piece: Observations, samples: Samples | None) -> tuple[Medium, Rays]:
+def observed_medium(scene: Scene, piece: Observations, samples: Samples | None, settings: Settings) -> tuple[Medium, Rays]:
     """What the rays of a piece march through, resampled anew or from kept samples, and the rays inside of it."""
     rays, _ = enter(scene, piece.origin, piece.direction)
-    through = medium(scene, Settings())
+    # Without a bound on what is negligible, derivatives would not leap over anything.
+    through = medium(scene, settings, occupancy(scene, settings) if settings.negligible else None)
     if samples is not None:
         through = through._replace(field=KeptField(samples.stored, piece.start, samples.low, samples.scale, samples.stride))
     return through, rays

@@ -29,11 +29,13 @@ from jvr.march.march import (
     MarchOptions,
     Medium,
     Noted,
+    for_derivatives,
     integrate,
     lanes_of,
     march,
     opacity,
     places,
+    shown,
     through,
     transmittance,
 )
@@ -169,8 +171,7 @@ def replay(wanted: Any, fixed: Any, noted: Noted, cotangent: Marched) -> Any:
     """
     medium, rays, dt = eqx.combine(wanted, fixed)
     if jax.tree.leaves(wanted[0].transfer):
-        # An invisible brick may have a derivative: that of extinction at zero is not zero.
-        medium = medium._replace(occupancy=None)
+        medium = for_derivatives(medium)
     rays_mask = is_there(wanted[1])
     zeros = functools.partial(jax.tree.map, jnp.zeros_like)
 
@@ -194,6 +195,7 @@ def replay(wanted: Any, fixed: Any, noted: Noted, cotangent: Marched) -> Any:
 def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marched, state: _ReplayState, total: _Gradients):
     state = state._replace(j=back.leap(medium, dt, state.j))
     lanes, (k, count) = back.lanes, back.at(state.j)
+    count = shown(medium, lanes, dt, k, count)
     # The field is not among `small`: it deposits its derivative itself, in place, through the tap.
     small_mask = is_there((total.medium.transfer, total.medium.shader, state.gradient, total.dt))
     small, rest = eqx.partition((medium.transfer, medium.shader, lanes.rays, dt), small_mask)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jvr.march.adjoint import Inputs, is_there, replay_march
-from jvr.march.march import Marched, MarchOptions, Medium, march
+from jvr.march.march import Marched, MarchOptions, Medium, for_derivatives, march
 from jvr.march.rows import TableRows, table_rows
 from jvr.march.steps import Rays
 from jvr.model.transfer import AbstractTable, AbstractTransfer
@@ -35,12 +35,11 @@ class Replay(AbstractAdjoint):
 
 
 class Forward(AbstractAdjoint):
-    """Forward mode (`jvp`, `jacfwd`), for one or few directions; takes every sample. JAX refuses reverse mode through it: use
-    `Replay()`."""
+    """Forward mode (`jvp`, `jacfwd`), for one or few directions; takes every sample that is not negligible. JAX refuses reverse mode
+    through it: use `Replay()`."""
 
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
-        # What is skipped has no tangent, and the tangent of zero extinction is not zero.
-        return march(options, medium._replace(occupancy=None), rays, dt)
+        return march(options, for_derivatives(medium), rays, dt)
 
 
 class Rows(AbstractAdjoint):

@@ -65,6 +65,13 @@ class Medium(NamedTuple):
     occupancy: Occupancy | None = None
 
 
+def for_derivatives(medium: Medium) -> Medium:
+    """What a march goes through whose derivative with respect to the transfer function is taken: an empty brick may have one, since
+    that of extinction at zero is not zero."""
+    leaps = medium.occupancy is not None and medium.occupancy.in_derivatives
+    return medium if leaps else medium._replace(occupancy=None)
+
+
 @dataclasses.dataclass(frozen=True)
 class MarchOptions:
     """Static choices of a march. A ray ends once its transmittance, in every channel, is at most `termination`."""
@@ -156,7 +163,7 @@ def integrate(
         k = jnp.where(is_alive(options, lanes, progress), leap(medium, lanes, dt, progress.following), progress.following)
         leapt, progress = k > progress.following, progress._replace(following=k)
         alive = is_alive(options, lanes, progress)
-        emitted, dtau, u = take_segment(medium, lanes, dt, k, jnp.where(alive, lanes.segments, 0))
+        emitted, dtau, u = take_segment(medium, lanes, dt, k, shown(medium, lanes, dt, k, jnp.where(alive, lanes.segments, 0)))
         # Where a ray ends with a leap, the last segment that it leapt over is the one to be noted.
         front, last = note_front(progress, alive | leapt, k - ~alive) if for_replay else ((), ())
         sums = add_segment(progress.sums, emitted, dtau, u)
@@ -216,6 +223,15 @@ def first_visible(medium: Medium, lanes: Lanes, dt: Scalar) -> Int[Array, "rays"
     if medium.occupancy is None:
         return first
     return jax.lax.fori_loop(0, FIRST_LEAPS, lambda _, k: leap(medium, lanes, dt, k), first)
+
+
+def shown(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]) -> Int[Array, "rays"]:
+    """`count`, the number of segments, and 0 for rays whose segment `k` is not to be seen. A leap may end in another empty brick; where
+    empty means negligible, both directions have to take the same segments."""
+    if medium.occupancy is None or not medium.occupancy.in_derivatives:
+        return count
+    _, u = segment(k, count, lanes.rays.length, dt)
+    return jnp.where(medium.occupancy.shows(lanes.rays, u), count, 0)
 
 
 def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):

@@ -1,8 +1,9 @@
 """Where there is something to see: bricks that a transfer function leaves empty, and leaps over them.
 
-A brick is empty if no value between its smallest and largest voxel has any extinction; without extinction nothing is emitted either
-(`j = sigma_t rgb` in every optical model). Around each empty brick there is a cube of empty bricks, and a ray inside of it goes on
-with the first sample outside. Samples stay where they are, so a picture with leaps and one without take the same contributing samples.
+A brick is empty if no value between its smallest and largest voxel has extinction above a bound, by default zero; without
+extinction nothing is emitted either (`j = sigma_t rgb` in every optical model). Around each empty brick there is a cube of empty
+bricks, and a ray inside of it goes on with the first sample outside. Samples stay where they are, so a picture with leaps and one
+without take the same contributing samples.
 """
 
 import itertools
@@ -24,10 +25,12 @@ RADII = (0, 1, 2, 3, 5, 8, 13, 21)
 
 class Occupancy(eqx.Module):
     """`reach[b]`: 0 where brick `b` may be visible, else a number such that every brick nearer than it, by the largest of the three
-    differences of indices, is empty. `size`: voxels along an edge of a brick."""
+    differences of indices, is empty. `size`: voxels along an edge of a brick. `in_derivatives`: whether derivatives with respect to the
+    transfer function leap as well, although that of extinction at zero is not zero."""
 
     reach: UInt8[Array, "bx by bz"]
     size: int = eqx.field(static=True)
+    in_derivatives: bool = eqx.field(static=True, default=False)
 
     def leap(
         self, rays: Rays, u: Float[Array, "rays"], dt: Scalar, *, backwards: bool = False, within: bool = False
@@ -37,11 +40,9 @@ class Occupancy(eqx.Module):
         With midpoints at `u, u + dt, ...` none of those passed over is in a visible brick. With `within`, segments begin at `u`, and
         no point of those passed over is. Where rounding leaves a doubt, the leap is one segment shorter.
         """
-        shape, sign = self.reach.shape, -1.0 if backwards else 1.0
+        sign = -1.0 if backwards else 1.0
         p = [e + u * d for e, d in zip(rays.entry, rays.direction, strict=True)]
-        b = [jnp.clip(jnp.floor(x / self.size), 0, n - 1) for x, n in zip(p, shape, strict=True)]
-        index = (b[0].astype(jnp.int32) * shape[1] + b[1].astype(jnp.int32)) * shape[2] + b[2].astype(jnp.int32)
-        reach = self.reach.reshape(-1).at[index].get(mode="promise_in_bounds").astype(u.dtype)
+        b, reach = self._look(p)
         distance = jnp.full_like(u, jnp.inf)
         for x, d, brick in zip(p, rays.direction, b, strict=True):
             d = sign * d
@@ -51,16 +52,33 @@ class Occupancy(eqx.Module):
         steps = jnp.clip(steps, 0, 2**30).astype(jnp.int32)
         return jnp.where(reach > 0, steps, 0)
 
+    def shows(self, rays: Rays, u: Float[Array, "rays"]) -> Bool[Array, "rays"]:
+        """Whether the brick at distance `u` is visible."""
+        return self._look([e + u * d for e, d in zip(rays.entry, rays.direction, strict=True)])[1] == 0
 
-def occupancy_of(bricks: Bricks, slope: Scalar, intercept: Scalar, transfer: AbstractTransfer) -> Occupancy:
-    """Which bricks of a volume a transfer function makes visible; milliseconds, traceable. Not differentiable."""
+    def _look(self, p: list[Float[Array, "rays"]]) -> tuple[list[Float[Array, "rays"]], Float[Array, "rays"]]:
+        """The brick around each grid position, and its reach."""
+        shape = self.reach.shape
+        b = [jnp.clip(jnp.floor(x / self.size), 0, n - 1) for x, n in zip(p, shape, strict=True)]
+        index = (b[0].astype(jnp.int32) * shape[1] + b[1].astype(jnp.int32)) * shape[2] + b[2].astype(jnp.int32)
+        return b, self.reach.reshape(-1).at[index].get(mode="promise_in_bounds").astype(p[0].dtype)
+
+
+def occupancy_of(
+    bricks: Bricks, slope: Scalar, intercept: Scalar, transfer: AbstractTransfer, least: Scalar | float | None = None
+) -> Occupancy:
+    """Which bricks of a volume a transfer function makes visible; milliseconds, traceable. Not differentiable.
+
+    With a bound `least` on extinction, what is below it is not visible, and derivatives leap over it too.
+    """
     slope, intercept, transfer = jax.lax.stop_gradient((slope, intercept, transfer))
     ends = [slope * bound.astype(slope.dtype) + intercept for bound in (bricks.lower, bricks.upper)]
     low, high = jnp.minimum(*ends), jnp.maximum(*ends)
     # Interpolated values exceed those they are made of by a few roundings.
     margin = 8 * jnp.finfo(slope.dtype).eps * jnp.maximum(jnp.abs(low), jnp.abs(high))
-    visible = jax.vmap(transfer.is_visible)((low - margin).ravel(), (high + margin).ravel()).reshape(low.shape)
-    return Occupancy(_reach(~(visible | jnp.isnan(low + high))), bricks.size)
+    is_visible = jax.vmap(lambda low, high: transfer.is_visible(low, high, 0.0 if least is None else least))
+    visible = is_visible((low - margin).ravel(), (high + margin).ravel()).reshape(low.shape)
+    return Occupancy(_reach(~(visible | jnp.isnan(low + high))), bricks.size, in_derivatives=least is not None)
 
 
 def _reach(empty: Bool[Array, "bx by bz"]) -> UInt8[Array, "bx by bz"]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jvr.march.adjoint import BackLanes, Behind, segment_cotangents, step_back
 from jvr.march.batch import pooled_while
-from jvr.march.march import Marched, MarchOptions, Medium, integrate, lanes_of, transmittance
+from jvr.march.march import Marched, MarchOptions, Medium, for_derivatives, integrate, lanes_of, shown, transmittance
 from jvr.march.steps import Rays, points_at, segment
 from jvr.model.transfer import AbstractTable
 from jvr.types import Scalar
@@ -49,6 +49,7 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
 
     Distances have no rows. Memory: `rays x entries` numbers for each row that `TableRows` lists. Detached as in `march`.
     """
+    medium = for_derivatives(medium)
     gathered, noted = integrate(options, medium, rays, dt, for_replay=True)
     assert isinstance(medium.transfer, AbstractTable)
     assert noted is not None
@@ -78,7 +79,9 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
 
 def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, behind: Behind, j: Int[Array, "rays"]):
     """One segment of every ray: the state before it, where its samples fall in the table, and the weights of their hats."""
+    j = back.leap(medium, dt, j)
     lanes, (k, count) = back.lanes, back.at(j)
+    count = shown(medium, lanes, dt, k, count)
     extent, distance = segment(k, count, lanes.rays.length, dt)
     points = points_at(lanes.rays, lanes.ray, k, distance)
     s = jax.vmap(medium.field.resample)(points)

@@ -32,8 +32,8 @@ class AbstractTransfer(eqx.Module):
         """Colour and extinction at one scalar value; traceable and differentiable in `s` and in every array."""
 
     @abc.abstractmethod
-    def is_visible(self, low: Scalar, high: Scalar) -> Bool[Array, ""]:
-        """Whether any value from `low` to `high` may have extinction other than zero; never falsely `False`."""
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
+        """Whether any value from `low` to `high` may have extinction above `least`; never falsely `False`."""
 
 
 class AbstractTable(AbstractTransfer):
@@ -45,9 +45,9 @@ class AbstractTable(AbstractTransfer):
     def coordinate(self, s: Scalar) -> Scalar:
         """Where `s` falls in the table, 0 ... n-1, clamped; entry `i` has weight `max(0, 1 - |coordinate - i|)`."""
 
-    def is_visible(self, low: Scalar, high: Scalar) -> Bool[Array, ""]:
-        # Entries that are not zero are counted: a difference of sums of the extinctions themselves would round small ones away.
-        lit = self.sigma_t.reshape(self.sigma_t.shape[0], -1) != 0
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
+        # Entries above the bound are counted: a difference of sums of the extinctions themselves would round small ones away.
+        lit = ~(jnp.abs(self.sigma_t.reshape(self.sigma_t.shape[0], -1)) <= least)
         before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(jnp.any(lit, axis=1), dtype=jnp.int32)])
         first, last = (jnp.floor(self.coordinate(s)).astype(jnp.int32) for s in (low, high))
         return before[jnp.minimum(last + 2, before.size - 1)] > before[first]
@@ -162,11 +162,11 @@ class GaussianTransfer(AbstractTransfer):
         weight = divide_or_zero(weight, jnp.broadcast_to(jnp.sum(weight), weight.shape))
         return Classified(_three(self.rgb.T @ weight), sigma_t)
 
-    def is_visible(self, low: Scalar, high: Scalar) -> Bool[Array, ""]:
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
         # The largest extinction of each Gaussian in the range: at its centre, or at the end nearer to it. Zero is where it underflows.
         nearest = jnp.clip(self.center, low, high)
         height = self.height if self.height.ndim == 1 else jnp.max(self.height, axis=1)
-        return jnp.any(height * jnp.exp(-0.5 * jnp.square((nearest - self.center) / self.width)) != 0)
+        return ~(jnp.sum(jnp.abs(height) * jnp.exp(-0.5 * jnp.square((nearest - self.center) / self.width))) <= least)
 
 
 def _colour(rgb: ArrayLike, n: int) -> Float[Array, "n 3"]:

@@ -63,13 +63,18 @@ def occupancy(scene: Scene, settings: Settings) -> Occupancy | None:
         with jax.ensure_compile_time_eval():
             bricks = volume.bricked().bricks
     assert bricks is not None
-    return occupancy_of(bricks, volume.slope, volume.intercept, scene.transfer)
+    # No ray is longer than the volume's diameter, so that the optical depth of all that is skipped stays below the bound.
+    least = jax.lax.stop_gradient(settings.negligible / (2 * volume.radius)) if settings.negligible else None
+    return occupancy_of(bricks, volume.slope, volume.intercept, scene.transfer, least)
 
 
-def _skipping(volume: Volume) -> str:
+def _skipping(volume: Volume, settings: Settings) -> str:
+    if not settings.skipping:
+        return "every sample is taken"
+    bound = f", and those of optical depth below {settings.negligible:g} a ray" if settings.negligible else ""
     if volume.bricks is None:
-        return "bricks are bounded anew for each picture: jvr.Volume.bricked() does it once"
-    return f"bricks of {volume.bricks.size}^3 voxels"
+        return f"empty bricks{bound}; they are bounded anew for each picture: jvr.Volume.bricked() does it once"
+    return f"empty bricks of {volume.bricks.size}^3 voxels{bound}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +116,7 @@ def plan(scene: Scene, settings: Settings = Settings()) -> Plan:
         Part("transfer", True, f"{type(transfer).__name__}, {'coloured' if coloured else 'grey'} extinction"),
         Part("pre-integration", isinstance(quadrature, PreIntegrated), quadrature.explanation),
         Part("optical model", True, type(scene.optical).__name__),
-        Part("empty-space skipping", settings.skipping, _skipping(volume) if settings.skipping else "every sample is taken"),
+        Part("empty-space skipping", settings.skipping, _skipping(volume, settings)),
         Part(
             "early termination", settings.termination > 0 and not transparent, "nothing absorbs" if transparent else termination
         ),

@@ -20,6 +20,10 @@ class Settings(eqx.Module):
     - `quadrature`: how a segment is integrated: `jvr.Midpoint()` (default) or `jvr.PreIntegrated()`.
     - `skipping`: whether rays leap over bricks of the volume that the transfer function leaves empty. The picture is the same to
       rounding; what gradients skip is what has none.
+    - `negligible`: optical depth of what a ray may leave out on top of that, in pictures, gradients and fits: bricks whose extinction is so
+      small that a whole ray through the volume would gather less. A pixel changes by at most this times the brightest radiance, and
+      so does `sigma_t` times the derivative in `sigma_t`; every evaluation looks anew. An extinction of zero then has the derivative
+      zero where a brick has nothing else. 0 leaves out nothing that has a derivative.
     - `adjoint`: how derivatives are computed: `jvr.Replay()` (reverse mode, default), `jvr.Forward()` or `jvr.Rows()`.
     - `sampling`: which samples are taken: `jvr.Uniform()` (default: all), `jvr.Refinement()` or `jvr.Slices()`.
     - `tile`: rays marched at a time. Memory is about 120 bytes a ray; smaller tiles need less and take longer.
@@ -31,6 +35,7 @@ class Settings(eqx.Module):
     termination: float = eqx.field(static=True)
     quadrature: AbstractQuadrature
     skipping: bool = eqx.field(static=True)
+    negligible: float = eqx.field(static=True)
     adjoint: AbstractAdjoint
     sampling: AbstractSampling
     tile: int = eqx.field(static=True)
@@ -42,6 +47,7 @@ class Settings(eqx.Module):
         termination: float | int = 1e-4,
         quadrature: AbstractQuadrature = Midpoint(),
         skipping: bool = True,
+        negligible: float | int = 0.0,
         adjoint: AbstractAdjoint = Replay(),
         sampling: AbstractSampling = Uniform(),
         tile: int = 262_144,
@@ -54,6 +60,12 @@ class Settings(eqx.Module):
             raise TypeError(f"quadrature must be jvr.Midpoint() or jvr.PreIntegrated(), not {quadrature!r}")
         if not isinstance(skipping, bool):
             raise TypeError(f"skipping must be True or False, not {skipping!r}")
+        if isinstance(negligible, bool) or not isinstance(negligible, int | float) or not 0 <= negligible < 1:
+            raise ValueError(f"negligible must be an optical depth in [0, 1), not {negligible!r}; 1e-3 changes no 8-bit picture")
+        if negligible and not skipping:
+            raise ValueError("negligible bricks can only be left out with skipping=True")
+        if negligible and not isinstance(quadrature, Midpoint):
+            raise ValueError("what is negligible is left out by midpoints: set quadrature=jvr.Midpoint()")
         if isinstance(tile, bool) or not isinstance(tile, int) or tile < 1:
             raise ValueError(f"tile must be a positive number of rays, not {tile!r}")
         if not isinstance(adjoint, AbstractAdjoint):
@@ -64,6 +76,7 @@ class Settings(eqx.Module):
         self.termination = float(termination)
         self.quadrature = quadrature
         self.skipping = skipping
+        self.negligible = float(negligible)
         self.adjoint = adjoint
         self.sampling = sampling
         self.tile = tile

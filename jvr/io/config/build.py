@@ -76,6 +76,7 @@ def build_settings(config: Config) -> Settings:
             termination=table.termination,
             quadrature=QUADRATURES[table.quadrature](),
             skipping=table.skipping,
+            negligible=table.negligible,
             adjoint=ADJOINTS[table.adjoint](),
             sampling=_sampling(table.sampling),
             tile=table.tile,

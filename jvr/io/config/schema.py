@@ -287,6 +287,7 @@ class SettingsTable(Table):
     termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", 0.0, 0.999)] = 1e-4
     quadrature: Literal["midpoint", "pre-integrated"] = "midpoint"
     skipping: bool = True
+    negligible: Annotated[float, number("optical depth that a ray may leave out, 0 for none", 0.0, 0.999)] = 0.0
     tile: Annotated[int, whole("rays at a time", 1)] = 262_144
     adjoint: Literal["replay", "forward", "rows"] = "replay"
     sampling: Sampling = UniformTable(kind="uniform")
