@@ -1,5 +1,8 @@
 """Phase functions: normalisation, moments, samples against the pdf, and digits of values and derivatives."""
 
+import re
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -138,7 +141,7 @@ def _value_and_derivatives(dtype, pole):
     by_gap = lambda g, angle, along: jax.jvp(lambda angle: value(g, angle), (angle,), (along,))[1]
     g = jnp.asarray(ASYMMETRIES, dtype)
     return [
-        np.asarray(jax.vmap(jax.vmap(f, (None, 0, 0)), (0, None, None))(g, angle, along), np.float64)
+        np.asarray(jax.jit(jax.vmap(jax.vmap(f, (None, 0, 0)), (0, None, None)))(g, angle, along), np.float64)
         for f in (lambda g, angle, _: value(g, angle), lambda g, angle, _: by_g(g, angle), by_gap)
     ]
 
@@ -154,9 +157,6 @@ def test_henyey_greenstein_keeps_its_digits_in_float32(pole):
     # The derivative in g has a zero, where a gap of float32 fixes it only up to that of `p / (1 - |g|)`, its size on both sides.
     size = np.abs(double[1]) + double[0] / (1.0 - np.abs(ASYMMETRIES.astype(float)))[:, None]
     assert np.max(np.abs(single[1] - double[1]) / size) < 1e-6
-    print("ACC", [np.max(np.abs(s / d - 1)[d != 0]) for s, d in zip(single[::2], double[::2])], np.max(np.abs(single[1] - double[1]) / size))
-    clear = np.abs(double[1]) > 0.1 * size
-    print("ACC", np.max(np.abs(single[1] / double[1] - 1)[clear]), clear.mean())
 
 
 def test_directions_keep_the_digits_of_small_angles():
@@ -175,7 +175,6 @@ def test_directions_keep_the_digits_of_small_angles():
     single = values(jnp.float32)
     with jax.enable_x64(True):
         double = values(jnp.float64)
-    print("DIR", np.max(np.abs(np.array(single) / np.array(double) - 1)))
     np.testing.assert_allclose(single, double, rtol=1e-6)
 
 
@@ -214,9 +213,9 @@ def test_values_and_derivatives_are_finite_at_extremes(name):
     for f in (value, jax.grad(value, (0, 1)), forward):
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(over(f)))
     u = jnp.asarray([0.0, 1e-7, 0.5, 1.0 - 6e-8], jnp.float32)
-    drawn = over_samples = jax.jit(jax.vmap(lambda x: FINITE[name](x).sample(u)))(x)
+    drawn = jax.jit(jax.vmap(lambda x: FINITE[name](x).sample(u)))(x)
     assert np.all(np.isfinite(drawn))
-    assert np.all(np.minimum(over_samples.one_minus, over_samples.one_plus) >= 0)
+    assert np.all(np.minimum(drawn.one_minus, drawn.one_plus) >= 0)
 
 
 def test_derivatives_at_no_asymmetry():
@@ -228,9 +227,9 @@ def test_derivatives_at_no_asymmetry():
     np.testing.assert_allclose(tangent(Schlick), 2 * c / (4 * np.pi), atol=1e-7)
 
 
-def _values(phase, angle=None):
-    angle = ScatteringAngle.of_cosine(jnp.linspace(-1.0, 1.0, 101)) if angle is None else angle
-    return np.stack(phase.evaluate(angle))
+def _values(phase):
+    angle = ScatteringAngle.of_cosine(jnp.linspace(-1.0, 1.0, 101))
+    return np.stack(eqx.filter_jit(type(phase).evaluate)(phase, angle))
 
 
 def test_closed_forms(x64):
@@ -241,10 +240,10 @@ def test_closed_forms(x64):
     for g in (-0.8, 0.0, 0.4):
         np.testing.assert_allclose(_values(HenyeyGreenstein(g))[0], hg(g), rtol=1e-12)
         np.testing.assert_allclose(_values(Schlick(g))[0], (1 - g * g) / (4 * np.pi * (1 - g * c) ** 2), rtol=1e-12)
-    # Parameters of droplets of 10 micrometres, evaluated by hand from the paper's formulas.
-    g_hg, g_d, alpha, w = 0.98817617, 0.55567946, 22.0034, 0.48201
+    # The paper's four formulas at 10 micrometres.
+    g_hg, g_d, alpha, w = 0.988176691700256, 0.5556712547839497, 21.995520856274638, 0.4819554318404214
     droplets = (1 - w) * hg(g_hg) + w * hg(g_d) * (1 + alpha * c * c) / (1 + alpha * (1 + 2 * g_d**2) / 3)
-    print(_values(JendersieEon(10.0))[0] / droplets)
+    np.testing.assert_allclose(_values(JendersieEon(10.0))[0], droplets, rtol=1e-12)
 
 
 def test_special_cases_agree(x64):
@@ -279,11 +278,10 @@ def test_components_are_those_of_each_colour():
         )
 
 
-def test_droplets_scatter_as_far_forward_as_mie_theory_has_it():
-    # Cloud droplets in visible light: 0.8 to 0.9, growing with their size (Hansen and Travis 1974).
+def test_droplets_scatter_as_far_forward_as_clouds_do():
+    # Mie theory gives water clouds in visible light a mean cosine of about 0.85, more for larger droplets.
     means = [float(JendersieEon(d).mean_cosine[0]) for d in (5.0, 10.0, 20.0, 50.0)]
-    assert 0.75 < means[0] < means[1] < means[2] < means[3] < 0.95
-    print(means)
+    assert 0.8 < means[0] < means[1] < means[2] < means[3] < 0.9
 
 
 def test_a_fine_table_converges_in_second_order(x64):
@@ -293,7 +291,6 @@ def test_a_fine_table_converges_in_second_order(x64):
         angles = np.linspace(0.0, np.pi, n)
         table = TabulatedPhase(angles, 7.0 * HenyeyGreenstein(0.5).evaluate(ScatteringAngle.of_cosine(jnp.cos(angles)))[0])
         errors.append(np.max(np.abs(_values(table) / wanted - 1)))
-    print(errors)
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
     assert np.all(orders > 1.7)
     assert errors[-1] < 1e-3
@@ -314,7 +311,6 @@ def test_tables_keep_the_digits_of_narrow_peaks():
     single = evaluate(jnp.float32)
     with jax.enable_x64(True):
         double = evaluate(jnp.float64)
-    print("TAB", [np.max(np.abs(s / d - 1)) for s, d in zip(single, double)])
     np.testing.assert_allclose(single[0], double[0], rtol=1e-5)
     np.testing.assert_allclose(single[1], double[1], rtol=1e-5)
 
@@ -322,7 +318,7 @@ def test_tables_keep_the_digits_of_narrow_peaks():
 def test_derivatives_of_a_table_are_those_of_finite_differences(x64):
     angle = ScatteringAngle.of_cosine(jnp.linspace(-0.97, 0.98, 12))
     weights = jnp.linspace(1.0, 2.0, 12)
-    loss = lambda values: jnp.sum(weights * TabulatedPhase(ANGLES, values).evaluate(angle)[0])
+    loss = jax.jit(lambda values: jnp.sum(weights * TabulatedPhase(ANGLES, values).evaluate(angle)[0]))
     values, step = jnp.asarray(BUMPY + 0.1), 1e-5
     differences = [(loss(values + step * e) - loss(values - step * e)) / (2 * step) for e in np.eye(values.size)]
     # Central differences: an error of step squared.
@@ -330,22 +326,20 @@ def test_derivatives_of_a_table_are_those_of_finite_differences(x64):
     np.testing.assert_allclose(jax.jacfwd(loss)(values), differences, rtol=1e-7, atol=1e-10)
 
 
-def test_derivatives_of_parameters_are_those_of_finite_differences(x64):
+@pytest.mark.parametrize("name", [name for name in FINITE if name != "table"])
+def test_derivatives_of_parameters_are_those_of_finite_differences(x64, name):
     angle = ScatteringAngle.of_cosine(jnp.linspace(-1.0, 1.0, 7))
-    for name, make in FINITE.items():
-        if name == "table":
-            continue
-        for x in (-0.6, 0.4):
-            value = lambda x, make=make: make(x).evaluate(angle)[0]
-            difference = (value(jnp.asarray(x + 1e-6)) - value(jnp.asarray(x - 1e-6))) / 2e-6
-            np.testing.assert_allclose(jax.jacrev(value)(jnp.asarray(x)), difference, rtol=1e-6, atol=1e-9, err_msg=name)
+    value = lambda x: FINITE[name](x).evaluate(angle)[0]
+    over, x = jax.jit(jax.vmap(value)), jnp.asarray([-0.6, 0.4])
+    differences = (over(x + 1e-6) - over(x - 1e-6)) / 2e-6
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.jacrev(value)))(x), differences, rtol=1e-6, atol=1e-9)
 
 
 ERRORS = {
     "g of 1": (lambda: HenyeyGreenstein(1.0), "g must lie between -1 and 1"),
     "g of -1 in one channel": (lambda: HenyeyGreenstein([0.0, -1.0, 0.0]), "g must lie between -1 and 1"),
     "g NaN": (lambda: HenyeyGreenstein(np.nan), "g must lie between -1 and 1"),
-    "two channels": (lambda: HenyeyGreenstein([0.0, 0.1]), "must be () or (3)"),
+    "two channels": (lambda: HenyeyGreenstein([0.0, 0.1]), "must be () or (3,)"),
     "g2 too large": (lambda: DoubleHenyeyGreenstein(0.1, 1.5, 0.5), "g2 must lie"),
     "weight above 1": (lambda: DoubleHenyeyGreenstein(0.1, 0.5, 1.5), "weight, of the first lobe, must be in [0, 1]"),
     "k of 1": (lambda: Schlick(1.0), "k must lie between -1 and 1"),
@@ -370,9 +364,8 @@ ERRORS = {
 @pytest.mark.parametrize("name", ERRORS)
 def test_errors_say_what_is_wrong_in_one_line(name):
     call, says = ERRORS[name]
-    with pytest.raises(ValueError, match="") as caught:
+    with pytest.raises(ValueError, match=re.escape(says)) as caught:
         call()
     message = str(caught.value)
-    assert says in message.replace(",)", ")")
     assert "\n" not in message
     assert len(message) < 200

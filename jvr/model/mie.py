@@ -25,7 +25,7 @@ from jvr.types import ArrayLike, Channels, Scalar
 
 
 class Draine(AbstractPhase):
-    """`p = HG(g) (1 + alpha cos^2 theta) / (1 + alpha (1 + 2 g^2) / 3)` (Draine 2003, ApJ 598, equation 4).
+    """`p = HG(g) (1 + alpha cos^2 theta) / (1 + alpha (1 + 2 g^2) / 3)` (Draine 2003, ApJ 598, 1017).
 
     `alpha = 0` is Henyey-Greenstein; `g = 0`, `alpha = 1` is Rayleigh; `alpha = 1` is Cornette and Shanks 1992. The mean cosine is
     not `g`.
@@ -53,7 +53,7 @@ class Draine(AbstractPhase):
 
 class JendersieEon(AbstractPhase):
     """Fog and clouds: a fit to Mie theory for water droplets, `(1 - w) HG(g_HG) + w Draine(g_D, alpha)` (Jendersie and d'Eon
-    2023, An Approximate Mie Scattering Function for Fog and Cloud Rendering, SIGGRAPH Talks, equations 4 to 7).
+    2023, An Approximate Mie Scattering Function for Fog and Cloud Rendering, SIGGRAPH Talks).
 
     **Arguments:** `diameter` of the droplets in micrometres, `()` or `(3,)`, in [5, 50]; differentiable.
     **Raises** `ValueError` otherwise.
@@ -141,9 +141,10 @@ class TabulatedPhase(AbstractPhase):
 
     def _nodes(self) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "m"]]:
         """`1 - cos` and `1 + cos` of the angles, and by how much `cos` falls from each to the next, none of them by a difference."""
+        # The angles themselves are halved, never their sums: near pi those would round away the digits of `1 + cos`.
         sine, cosine = jnp.sin(0.5 * self.angles), jnp.cos(0.5 * self.angles)
-        middles, halves = 0.5 * (self.angles[1:] + self.angles[:-1]), 0.5 * jnp.diff(self.angles)
-        return 2.0 * sine * sine, 2.0 * cosine * cosine, 2.0 * jnp.sin(middles) * jnp.sin(halves)
+        middle = sine[1:] * cosine[:-1] + cosine[1:] * sine[:-1]
+        return 2.0 * sine * sine, 2.0 * cosine * cosine, 2.0 * middle * jnp.sin(0.5 * jnp.diff(self.angles))
 
     def _columns(self, widths: Float[Array, "m"]) -> list[tuple[Float[Array, "n"], Float[Array, "m"]]]:
         """For each component its values and the integral over each interval of the cosine."""
