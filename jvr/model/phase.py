@@ -28,7 +28,7 @@ _UNIFORM = 0.25 / math.pi
 class ScatteringAngle(NamedTuple):
     """The angle theta between light before and after it is scattered, arrays of one shape.
 
-    `cos theta` in float32 cannot tell angles below 0.02 degrees apart, and a lobe of `g = 0.9999` is no wider. So the gaps
+    `cos theta` in float32 cannot tell angles below 0.02 degrees apart, and a lobe of `g = 0.9999` is narrower. So the gaps
     `1 - cos theta` and `1 + cos theta` are kept with their own digits.
     """
 
