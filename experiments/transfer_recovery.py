@@ -62,7 +62,7 @@ def random_starts(protocol: Protocol, count: int) -> dict[str, Any]:
     rng = np.random.default_rng(0)
     scores = []
     for i in range(count):
-        n = protocol.start.transfer.rgb.shape[0]
+        n = UNKNOWNS(protocol.start)[0].shape[0]
         tables = (rng.random((n, 3)), 10 ** rng.uniform(-3.5, -0.5, n))
         start = eqx.tree_at(UNKNOWNS, protocol.start, tuple(np.asarray(t, np.float32) for t in tables))
         result = fit(Protocol(**{**vars(protocol), "start": start}))

@@ -13,10 +13,25 @@ from jvr.march.oracle import OpacityChange as OpacityChange
 from jvr.march.quadrature import Midpoint as Midpoint
 from jvr.march.quadrature import PreIntegrated as PreIntegrated
 from jvr.model import presets as presets
+from jvr.model.by_value import ByValue as ByValue
 from jvr.model.camera import OrthographicCamera as OrthographicCamera
 from jvr.model.camera import PerspectiveCamera as PerspectiveCamera
 from jvr.model.camera import fibonacci_sphere as fibonacci_sphere
 from jvr.model.camera import orbit as orbit
+from jvr.model.gradient_transfer import GradientOpacity as GradientOpacity
+from jvr.model.gradient_transfer import GradientTransfer as GradientTransfer
+from jvr.model.light import AmbientLight as AmbientLight
+from jvr.model.light import DirectionalLight as DirectionalLight
+from jvr.model.light import HeadLight as HeadLight
+from jvr.model.light import PointLight as PointLight
+from jvr.model.light import SpotLight as SpotLight
+from jvr.model.light import disc_light as disc_light
+from jvr.model.light import sphere_light as sphere_light
+from jvr.model.normals import AnalyticGradient as AnalyticGradient
+from jvr.model.normals import CentralDifferences as CentralDifferences
+from jvr.model.normals import ForwardDifferences as ForwardDifferences
+from jvr.model.normals import PrecomputedGradient as PrecomputedGradient
+from jvr.model.normals import SobelDifferences as SobelDifferences
 from jvr.model.optical import AbsorptionOnly as AbsorptionOnly
 from jvr.model.optical import EmissionAbsorption as EmissionAbsorption
 from jvr.model.optical import EmissionOnly as EmissionOnly
@@ -39,6 +54,15 @@ from jvr.rendering.settings import Settings as Settings
 from jvr.types import Outcome as Outcome
 
 if TYPE_CHECKING:
+    from jvr.effects.deep_shadow_map import DeepShadowMap as DeepShadowMap
+    from jvr.effects.scattering import SingleScattering as SingleScattering
+    from jvr.effects.shading import BlinnPhong as BlinnPhong
+    from jvr.effects.shading import Lambert as Lambert
+    from jvr.effects.shading import Phong as Phong
+    from jvr.effects.shadow_map import ShadowMap as ShadowMap
+    from jvr.effects.shadow_rays import ShadowRays as ShadowRays
+    from jvr.effects.shadow_volume import OpacityShadowMap as OpacityShadowMap
+    from jvr.effects.shadow_volume import ShadowVolume as ShadowVolume
     from jvr.fitting.fit import FitResult as FitResult
     from jvr.fitting.fit import fit as fit
     from jvr.fitting.initialise import colours_given_extinction as colours_given_extinction
@@ -60,6 +84,15 @@ if TYPE_CHECKING:
     from jvr.fitting.unknowns import Sigmoid as Sigmoid
     from jvr.fitting.unknowns import Softplus as Softplus
     from jvr.io.volumes import read_volume as read_volume
+    from jvr.model.mie import Draine as Draine
+    from jvr.model.mie import JendersieEon as JendersieEon
+    from jvr.model.mie import TabulatedPhase as TabulatedPhase
+    from jvr.model.phase import DoubleHenyeyGreenstein as DoubleHenyeyGreenstein
+    from jvr.model.phase import HenyeyGreenstein as HenyeyGreenstein
+    from jvr.model.phase import Isotropic as Isotropic
+    from jvr.model.phase import Mixture as Mixture
+    from jvr.model.phase import Rayleigh as Rayleigh
+    from jvr.model.phase import Schlick as Schlick
     from jvr.rendering.measure import Measurement as Measurement
     from jvr.rendering.measure import measure as measure
     from jvr.rendering.tune import Tuned as Tuned
@@ -67,8 +100,15 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# Fitting alone takes longer to import than JAX, so it and the readers are imported by their first use.
+# Fitting alone takes longer to import than JAX, so it and the readers are imported by their first use; so are effects, of which
+# a scene without them needs none.
 _LATE = {
+    "jvr.effects.scattering": ("SingleScattering",),
+    "jvr.effects.shading": ("BlinnPhong", "Lambert", "Phong"),
+    "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
+    "jvr.effects.shadow_map": ("ShadowMap",),
+    "jvr.effects.shadow_rays": ("ShadowRays",),
+    "jvr.effects.shadow_volume": ("OpacityShadowMap", "ShadowVolume"),
     "jvr.fitting.fit": ("FitResult", "fit"),
     "jvr.fitting.initialise": ("colours_given_extinction", "flat_transfer"),
     "jvr.fitting.losses": (
@@ -84,6 +124,8 @@ _LATE = {
     "jvr.fitting.solvers": ("LBFGSB", "Dogleg", "GaussNewton", "LevenbergMarquardt"),
     "jvr.fitting.unknowns": ("Identity", "Ordered", "Sigmoid", "Softplus"),
     "jvr.io.volumes": ("read_volume",),
+    "jvr.model.mie": ("Draine", "JendersieEon", "TabulatedPhase"),
+    "jvr.model.phase": ("DoubleHenyeyGreenstein", "HenyeyGreenstein", "Isotropic", "Mixture", "Rayleigh", "Schlick"),
     "jvr.rendering.measure": ("Measurement", "measure"),
     "jvr.rendering.tune": ("Tuned", "tune"),
 }

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jvr.types import Corner, Triple
+from jvr.types import Affine, Corner, Triple
 
 Tree = TypeVar("Tree")
 
@@ -68,6 +68,34 @@ def normalise(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     is_zero = scale == 0
     scaled = jnp.where(is_zero, 1.0, vector / jnp.where(is_zero, 1.0, scale))
     return jnp.where(is_zero, 0.0, scaled / jnp.linalg.norm(scaled, axis=-1, keepdims=True))
+
+
+def direction_and_length(vector: Triple) -> tuple[Triple, Float[Array, "..."]]:
+    """Unit vector and length. One so short that its inverse would overflow counts as zero: it has no direction, length and derivatives
+    zero. Scaled first, so that squares neither overflow nor underflow."""
+    x, y, z = vector
+    scale = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.abs(z)))
+    limits = jnp.finfo(scale.dtype)
+    is_zero = scale < limits.tiny / limits.eps
+    inverse = jnp.where(is_zero, 0.0, 1.0 / jnp.where(is_zero, 1.0, scale))
+    scaled = tuple(jnp.where(is_zero, 1.0, c * inverse) for c in vector)
+    norm = jnp.sqrt(dot(scaled, scaled))
+    return tuple(jnp.where(is_zero, 0.0, c / norm) for c in scaled), jnp.where(is_zero, 0.0, scale * norm)
+
+
+def turned(matrix: Float[Array, "3 3"], x: Triple) -> Triple:
+    """A matrix times a vector."""
+    return tuple(sum((matrix[i, j] * x[j] for j in range(3)), jnp.zeros_like(x[i])) for i in range(3))
+
+
+def transformed(matrix: Affine, p: Triple) -> Triple:
+    """A position under an affine transform."""
+    return tuple(x + matrix[i, 3] for i, x in enumerate(turned(matrix[:3, :3], p)))
+
+
+def dot(a: Triple, b: Triple) -> Float[Array, "..."]:
+    """Inner product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def ray_box(origin: Triple, direction: Triple, lower: Corner, upper: Corner) -> tuple[Float[Array, "..."], Float[Array, "..."]]:

@@ -44,7 +44,8 @@ def colours_given_extinction(
     if not isinstance(scene.transfer, AbstractTable):
         raise ValueError(f"colours can be solved for in a table, not in {type(scene.transfer).__name__}")
     targets = check_images(cameras, images)
-    unknowns = choose_unknowns(Exposed(scene, None), lambda m: m.scene.transfer.rgb)
+    colours: Any = lambda scene: scene.transfer.rgb
+    unknowns = choose_unknowns(Exposed(scene, None), lambda m: colours(m.scene))
     problem = Problem(Exposed(scene, None), unknowns, settings, SquaredError(), (), None)
     chunk = min(16_384, sum(camera.width * camera.height for camera in cameras))
     start = jnp.ravel(scene.transfer.rgb)
@@ -56,4 +57,4 @@ def colours_given_extinction(
     scale = max(np.diag(matrix).max(), np.finfo(float).tiny)
     move = np.linalg.solve(matrix + ridge * scale * np.eye(start.size), -vector)
     rgb = np.clip(np.asarray(start) + move, 0, 1).reshape(scene.transfer.rgb.shape)
-    return eqx.tree_at(lambda s: s.transfer.rgb, scene, jnp.asarray(rgb, scene.transfer.rgb.dtype))
+    return eqx.tree_at(colours, scene, jnp.asarray(rgb, scene.transfer.rgb.dtype))

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jvr.fitting.losses import AbstractPrior, SquaredError
-from jvr.fitting.observations import Observations, Samples, observed_medium
+from jvr.fitting.observations import Observations, Samples, observed_medium, seen_in_fit
 from jvr.fitting.unknowns import Exposed, Unknowns
 from jvr.march.differentiation import AbstractAdjoint, Forward, Replay
 from jvr.march.march import Marched, MarchOptions
@@ -21,7 +21,6 @@ from jvr.march.rows import TableRows, table_rows
 from jvr.model.camera import AbstractCamera
 from jvr.model.transfer import AbstractTable
 from jvr.rendering.image import composite, step_length, trace
-from jvr.rendering.plan import occupancy
 from jvr.rendering.settings import Settings
 from jvr.types import Scalar, Triple
 
@@ -106,7 +105,7 @@ def image_value(
     settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
     losses = []
     for camera, target in zip(cameras, images, strict=True):
-        where = occupancy(model.scene, settings) if settings.negligible else None
+        where = seen_in_fit(model.scene, settings)
         pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
         gathered, rays, _ = trace(model.scene, camera, settings, pixels, where=where)
         rendered = jnp.stack(predict(problem, model, gathered, rays.length), axis=-1).reshape(target.shape)

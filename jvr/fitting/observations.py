@@ -15,8 +15,8 @@ from jvr.march.quadrature import Midpoint
 from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.rendering.image import enter, step_length
-from jvr.rendering.plan import medium, occupancy
+from jvr.rendering.image import Seen, enter, step_length
+from jvr.rendering.plan import medium, occupancy, visibility
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
 from jvr.types import Triple
@@ -148,11 +148,16 @@ def keep_samples(
     return Samples(jnp.asarray(stored), low, scale, chunk), kept
 
 
+def seen_in_fit(scene: Scene, settings: Settings) -> Seen:
+    """What is computed once for all rays. Without a bound on what is negligible, derivatives would not leap over anything."""
+    where = occupancy(scene, settings) if settings.negligible else None
+    return Seen(where, visibility(scene, where))
+
+
 def observed_medium(scene: Scene, piece: Observations, samples: Samples | None, settings: Settings) -> tuple[Medium, Rays]:
     """What the rays of a piece march through, resampled anew or from kept samples, and the rays inside of it."""
     rays, _ = enter(scene, piece.origin, piece.direction)
-    # Without a bound on what is negligible, derivatives would not leap over anything.
-    through = medium(scene, settings, occupancy(scene, settings) if settings.negligible else None)
+    through = medium(scene, settings, *seen_in_fit(scene, settings))
     if samples is not None:
         through = through._replace(field=KeptField(samples.stored, piece.start, samples.low, samples.scale, samples.stride))
     return through, rays
@@ -169,7 +174,7 @@ def _resample(scene: Scene, piece: Observations, settings: Settings, k: Int[Arra
     rays, _ = enter(scene, piece.origin, piece.direction)
     dt = step_length(scene, settings)
     _, u = segment(k, segment_count(rays.length, dt), rays.length, dt)
-    s = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
+    s = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u)).s
     return jnp.clip(jnp.round((s - low) / scale), 0, 65535).astype(jnp.uint16)
 
 

@@ -32,14 +32,16 @@ from jvr.march.march import (
     for_derivatives,
     integrate,
     lanes_of,
+    lit,
     march,
     opacity,
     places,
+    resample,
     shown,
     through,
     transmittance,
 )
-from jvr.march.steps import Rays, points_at, segment
+from jvr.march.steps import Rays, Sample, points_at, segment
 from jvr.numerics import computed_once, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
@@ -197,38 +199,44 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marc
     lanes, (k, count) = back.lanes, back.at(state.j)
     count = shown(medium, lanes, dt, k, count)
     # The field is not among `small`: it deposits its derivative itself, in place, through the tap.
-    small_mask = is_there((total.medium.transfer, total.medium.shader, state.gradient, total.dt))
-    small, rest = eqx.partition((medium.transfer, medium.shader, lanes.rays, dt), small_mask)
+    small_mask = is_there((total.medium.transfer, total.medium.shader, total.medium.shadows, state.gradient, total.dt))
+    small, rest = eqx.partition((medium.transfer, medium.shader, medium.shadows, lanes.rays, dt), small_mask)
 
-    def local(small: Any, taps: tuple[Array, ...]):
+    def local(small: Any, taps: tuple[Sample, ...]):
         """The segment as a function of what its derivative is wanted for; the taps stand for the field."""
-        transfer, shader, rays, dt = eqx.combine(small, rest)
+        transfer, shader, shadows, rays, dt = eqx.combine(small, rest)
         extent, u = segment(k, count, rays.length, dt)
         sampled = places(medium, rays, lanes.ray, k, u, extent)
-        resampled = computed_once(k < count, tuple(jax.vmap(medium.field.resample)(points) for points in sampled))
-        scalars = tuple(s + tap for s, tap in zip(resampled, taps, strict=True))
+        samples = jax.tree.map(jnp.add, resample(medium, sampled, k < count), taps)
+        samples = lit(medium._replace(shadows=shadows), sampled, samples, k < count, reverse=True)
         point = points_at(rays, lanes.ray, k, u)
-        looks = jax.vmap(shader.look, in_axes=(None, 0, 0, 0))(transfer, scalars, point, extent)
+        looks = jax.vmap(shader.look, in_axes=(None, 0, 0, 0))(transfer, samples, point, extent)
         return (*computed_once(k < count, looks), u), sampled
 
-    taps = (jnp.zeros_like(lanes.rays.length),) * len(medium.shader.places)
-    (emitted, dtau, u), pull, sampled = jax.vjp(local, small, taps, has_aux=True)
+    (emitted, dtau, u), pull, sampled = jax.vjp(local, small, _no_taps(medium, lanes.rays), has_aux=True)
 
     front = back.depth(state.j, state.behind, dtau)
     before = transmittance(*front)
     small_gradient, cotangents = pull(segment_cotangents(cotangent, state.behind, before, dtau, u))
 
-    transfer, shader, ray_gradient, dt_gradient = jax.tree.map(
-        jnp.add, (total.medium.transfer, total.medium.shader, state.gradient, total.dt), small_gradient
+    transfer, shader, shadows, ray_gradient, dt_gradient = jax.tree.map(
+        jnp.add, (total.medium.transfer, total.medium.shader, total.medium.shadows, state.gradient, total.dt), small_gradient
     )
     # Else the whole computation of the cotangent is repeated in each of the scattered additions, which then take three times as long.
     cotangents = computed_once(state.j < back.steps, cotangents)
     field = total.medium.field
-    for points, of_scalar in zip(sampled, cotangents, strict=True):
-        field = medium.field.deposit(field, points, of_scalar)
+    for points, of_sample in zip(sampled, cotangents, strict=True):
+        field = medium.field.deposit(field, points, of_sample)
     behind = step_back(state.behind, front, emitted, dtau, u)
     state = _ReplayState(behind, state.j + (state.j < back.steps), ray_gradient)
-    return state, _Gradients(Medium(field, transfer, shader, total.medium.occupancy), dt_gradient)
+    return state, _Gradients(Medium(field, transfer, shader, total.medium.occupancy, shadows), dt_gradient)
+
+
+def _no_taps(medium: Medium, rays: Rays) -> tuple[Sample, ...]:
+    """Zero for everything that is resampled at the places of a segment."""
+    points = points_at(rays, jnp.zeros_like(rays.length, jnp.int32), jnp.int32(0), rays.length)
+    one = jax.eval_shape(lambda: jax.vmap(medium.field.resample)(points))
+    return (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one),) * len(medium.shader.places)
 
 
 def is_there(tree: Any) -> Any:

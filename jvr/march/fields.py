@@ -3,39 +3,30 @@
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, UInt
+from jaxtyping import Array, Int, UInt
 
 from jvr.march.march import AbstractField
-from jvr.march.steps import Point
+from jvr.march.steps import Point, Sample
+from jvr.model.normals import AbstractNormals
 from jvr.model.volume import Volume
-from jvr.numerics import add_runs
 from jvr.types import Scalar
 
 
 class VoxelField(AbstractField):
-    """The voxels of a volume, interpolated between."""
+    """The voxels of a volume, interpolated between, with the gradient that `normals` makes of them where it is not `None`."""
 
     volume: Volume
+    normals: AbstractNormals | None = None
 
-    def resample(self, point: Point) -> Scalar:
-        return self.volume.sample(point.p)
+    def resample(self, point: Point) -> Sample:
+        if self.normals is None:
+            return Sample(self.volume.sample(point.p))
+        return Sample(*self.normals.resample(self.volume, point.p))
 
-    def deposit(self, gradient: Any, points: Point, cotangent: Float[Array, "rays"]) -> Any:
-        volume, total = self.volume, gradient.volume
-        if total.values is not None:
-            flat = total.values.reshape(-1)
-            for starts, weights in jax.vmap(lambda p: volume.interpolation.stencil(volume.shape, p))(points.p):
-                terms = jnp.stack([w * cotangent * volume.slope for w in weights], axis=1)
-                flat = add_runs(flat, starts, terms.astype(flat.dtype))
-            total = eqx.tree_at(lambda v: v.values, total, flat.reshape(volume.shape))
-        if total.slope is not None:
-            stored = jax.vmap(volume.interpolate)(points.p)
-            total = eqx.tree_at(lambda v: v.slope, total, total.slope + jnp.sum(stored * cotangent))
-        if total.intercept is not None:
-            total = eqx.tree_at(lambda v: v.intercept, total, total.intercept + jnp.sum(cotangent))
-        return VoxelField(total)
+    def deposit(self, gradient: Any, points: Point, cotangent: Sample) -> Any:
+        if self.normals is None:
+            return VoxelField(self.volume.deposit(gradient.volume, points.p, cotangent.s))
+        return VoxelField(*self.normals.deposit(self.volume, (gradient.volume, gradient.normals), points.p, cotangent[:3]))
 
 
 class KeptField(AbstractField):
@@ -48,10 +39,10 @@ class KeptField(AbstractField):
     scale: Scalar
     stride: int = eqx.field(static=True)
 
-    def resample(self, point: Point) -> Scalar:
+    def resample(self, point: Point) -> Sample:
         # Clipped: the index of a finished ray may lie beyond the end.
         index = self.start[point.ray] + point.segment * self.stride
-        return self.low + self.scale * self.stored.at[index].get(mode="clip").astype(self.low.dtype)
+        return Sample(self.low + self.scale * self.stored.at[index].get(mode="clip").astype(self.low.dtype))
 
-    def deposit(self, gradient: Any, points: Point, cotangent: Float[Array, "rays"]) -> Any:
+    def deposit(self, gradient: Any, points: Point, cotangent: Sample) -> Any:
         return gradient

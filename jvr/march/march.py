@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jvr.march.batch import pooled_while
 from jvr.march.occupancy import Occupancy
-from jvr.march.steps import Point, Rays, points_at, segment, segment_count
+from jvr.march.steps import Point, Rays, Sample, points_at, segment, segment_count
 from jvr.model.transfer import Classified
 from jvr.numerics import computed_once, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
@@ -27,16 +27,28 @@ FIRST_LEAPS = 4
 
 
 class AbstractField(eqx.Module):
-    """What is resampled along rays, the scalar `s`; its arrays may be large."""
+    """What is resampled along rays; its arrays may be large."""
 
     @abc.abstractmethod
-    def resample(self, point: Point) -> Scalar:
-        """The scalar at one point, in the data's units."""
+    def resample(self, point: Point) -> Sample:
+        """What is known at one point, but for the light there."""
 
     @abc.abstractmethod
-    def deposit(self, gradient: "AbstractField", points: Point, cotangent: Float[Array, "rays"]) -> "AbstractField":
+    def deposit(self, gradient: "AbstractField", points: Point, cotangent: Sample) -> "AbstractField":
         """Adds the derivative of `sum(cotangent * resample(points))` to `gradient`, in place where the compiler can; leaves of
         `gradient` that are `None` are not asked for."""
+
+
+class AbstractVisibility(eqx.Module):
+    """How much of each light reaches a point."""
+
+    @abc.abstractmethod
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
+        """For each light, the transmittance between it and each of a batch of points, one or three channels, or none where nothing can
+        shade it. What is not `wanted` may be anything finite.
+
+        Differentiable in reverse mode where `reverse` says so, else in forward mode.
+        """
 
 
 class AbstractShader(eqx.Module):
@@ -46,23 +58,33 @@ class AbstractShader(eqx.Module):
     places: ClassVar[tuple[float, ...]] = (0.0,)
 
     @abc.abstractmethod
-    def segment(self, medium: Classified, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+    def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         """Emitted radiance (three components or none) and optical depth (one, three or none) of one segment of length `dt` whose
         properties are constant."""
 
-    def look(self, transfer: Any, scalars: tuple[Scalar, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        """The same for a segment around `point`, from the scalars at `places`."""
-        (s,) = scalars
-        return self.segment(transfer.evaluate(s), point, dt)
+    def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        """The same for a segment around `point`, from what is known at `places`."""
+        sample = self.prepare(transfer, samples[0], point)
+        return self.segment(self.classify(transfer, sample), sample, point, dt)
+
+    def prepare(self, transfer: Any, sample: Sample, point: Point) -> Sample:
+        """The sample with its gradient in the world."""
+        return sample
+
+    def classify(self, transfer: Any, sample: Sample) -> Classified:
+        """Colour and extinction of a prepared sample."""
+        return transfer.evaluate(sample.s)
 
 
 class Medium(NamedTuple):
-    """What rays march through: resampled, classified, shaded; where `occupancy` is not `None`, only in visible bricks."""
+    """What rays march through: resampled, classified, shaded; where `occupancy` is not `None`, only in visible bricks; where `shadows`
+    is not `None`, each sample knows how much light reaches it."""
 
     field: AbstractField
     transfer: Any  # what `shader.look` reads: an AbstractTransfer, or one prepared for the shader
     shader: AbstractShader
     occupancy: Occupancy | None = None
+    shadows: AbstractVisibility | None = None
 
 
 def for_derivatives(medium: Medium) -> Medium:
@@ -237,12 +259,39 @@ def shown(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count
 def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
     """Emission and optical depth of segment `k` of every ray, and the distance of its midpoint; zero beyond `count`."""
     extent, u = segment(k, count, lanes.rays.length, dt)
-    scalars = tuple(jax.vmap(medium.field.resample)(points) for points in places(medium, lanes.rays, lanes.ray, k, u, extent))
-    # Else every channel of the shader resamples the field for itself.
-    scalars = computed_once(k < count, scalars)
+    sampled = places(medium, lanes.rays, lanes.ray, k, u, extent)
+    samples = lit(medium, sampled, resample(medium, sampled, k < count), k < count, reverse=False)
     point = points_at(lanes.rays, lanes.ray, k, u)
-    emitted, dtau = jax.vmap(medium.shader.look, in_axes=(None, 0, 0, 0))(medium.transfer, scalars, point, extent)
+    emitted, dtau = jax.vmap(medium.shader.look, in_axes=(None, 0, 0, 0))(medium.transfer, samples, point, extent)
     return emitted, dtau, u
+
+
+def resample(medium: Medium, sampled: list[Point], proof: Bool[Array, "rays"]) -> tuple[Sample, ...]:
+    """The field at each of the places, once for all channels of the shader; `proof` as in `computed_once`."""
+    return computed_once(proof, tuple(jax.vmap(medium.field.resample)(points) for points in sampled))
+
+
+def lit(
+    medium: Medium, sampled: list[Point], samples: tuple[Sample, ...], inside: Bool[Array, "rays"], *, reverse: bool
+) -> tuple[Sample, ...]:
+    """The samples with the light that reaches them, where that is asked for and they are `inside`."""
+    shadows = medium.shadows
+    if shadows is None:
+        return samples
+    found = []
+    for points, sample in zip(sampled, samples, strict=True):
+        # Where nothing is left out everything has a derivative, and between the ends of a segment there may be what is at neither.
+        everywhere = medium.occupancy is None or len(sampled) > 1
+        wanted = inside if everywhere else inside & has_extinction(medium, sample, points)
+        found.append(sample._replace(light=shadows.transmittances(points, wanted, reverse=reverse)))
+    return tuple(found)
+
+
+def has_extinction(medium: Medium, samples: Sample, points: Point) -> Bool[Array, "rays"]:
+    """Whether anything is to be seen at each of a batch of samples."""
+    shader = medium.shader
+    classify = lambda sample, point: shader.classify(medium.transfer, shader.prepare(medium.transfer, sample, point)).sigma_t
+    return functools.reduce(jnp.logical_or, [sigma != 0 for sigma in jax.vmap(classify)(samples, points)])
 
 
 def places(
@@ -307,9 +356,8 @@ def opaque_depth(dtype: Any) -> float:
 
 def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:
     """How many channels the medium emits and absorbs in, by shape alone."""
-    point = Point(tuple(x[0] for x in rays.entry), jnp.int32(0), jnp.int32(0))
-    scalars = (dt,) * len(medium.shader.places)
-    emitted, dtau = jax.eval_shape(medium.shader.look, medium.transfer, scalars, point, dt)
+    one = lanes_of(jax.tree.map(lambda x: x[:1], rays), dt)
+    emitted, dtau, _ = jax.eval_shape(lambda: take_segment(medium, one, dt, jnp.zeros_like(one.segments), one.segments))
     return len(emitted), len(dtau)
 
 

@@ -84,9 +84,10 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, behind: Behind, j:
     count = shown(medium, lanes, dt, k, count)
     extent, distance = segment(k, count, lanes.rays.length, dt)
     points = points_at(lanes.rays, lanes.ray, k, distance)
-    s = jax.vmap(medium.field.resample)(points)
-    classified = jax.vmap(medium.transfer.evaluate)(s)
-    (emitted, dtau), pull = jax.vjp(lambda c: jax.vmap(medium.shader.segment)(c, points, extent), classified)
+    samples = jax.vmap(medium.field.resample)(points)
+    samples = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, points)
+    classified = jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, samples)
+    (emitted, dtau), pull = jax.vjp(lambda c: jax.vmap(medium.shader.segment)(c, samples, points, extent), classified)
     front = back.depth(j, behind, dtau)
     before = transmittance(*front)
 
@@ -103,7 +104,7 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, behind: Behind, j:
         tau_sigma.append(of_entry.sigma_t[c])
     weights = TableRows(tuple(radiance_rgb), tuple(radiance_sigma), tuple(tau_sigma))
     assert isinstance(medium.transfer, AbstractTable)
-    u = jax.vmap(medium.transfer.coordinate)(s)
+    u = jax.vmap(medium.transfer.coordinate)(samples.s)
     return (step_back(behind, front, emitted, dtau, distance), j + (j < back.steps)), (u, weights)
 
 

@@ -40,7 +40,7 @@ from jvr.march.slices import (
     take_block,
     take_slice,
 )
-from jvr.march.steps import Point
+from jvr.march.steps import Point, Sample
 from jvr.types import Channels
 
 
@@ -148,8 +148,8 @@ def _deposit_level(slices: Slices, level: int, k: Int[Array, ""], cotangent: Flo
 
     def body(index: Int[Array, "lanes"], valid: Bool[Array, "lanes"], lanes: tuple[Array, Array], gradient: Any) -> Any:
         rows, cotangent = lanes[0], jnp.where(valid, lanes[1], 0.0)
-        point = Point(position(rows, k, slices.dt, volume.shape), index, jnp.broadcast_to(k, index.shape))
-        field: Any = VoxelField(volume).deposit(VoxelField(gradient.volume), point, cotangent)
+        point = Point(position(rows, k, slices.dt, volume.shape), (), index, jnp.broadcast_to(k, index.shape))
+        field: Any = VoxelField(volume).deposit(VoxelField(gradient.volume), point, Sample(cotangent))
         gradient = gradient._replace(volume=field.volume)
         if gradient.lattice.rays[level] is not None:
             at = lambda rows, dt: jax.vmap(volume.sample)(position(rows, k, dt, volume.shape))

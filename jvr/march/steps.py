@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.types import Scalar, Triple
+from jvr.types import Channels, Scalar, Triple
 
 
 class Rays(NamedTuple):
@@ -27,11 +27,26 @@ class Rays(NamedTuple):
 
 
 class Point(NamedTuple):
-    """One sample on one ray: its grid position, the ray's index in the batch and the index of its segment."""
+    """One sample on one ray: its grid position, the ray's direction (grid coordinates per world length), the ray's index in the batch
+    and the index of its segment."""
 
     p: Triple
+    direction: Triple
     ray: Int[Array, ""]
     segment: Int[Array, ""]
+
+
+class Sample(NamedTuple):
+    """What is known at a point; parts that nobody asks for are empty.
+
+    `s`: the scalar; `gradient`: its derivatives along the grid axes, or those of the extinction; `neighbours`: scalars around the
+    point, for a gradient of what the transfer function makes of them; `light`: for each light, the transmittance between it and the point.
+    """
+
+    s: Float[Array, "..."]
+    gradient: Triple = ()
+    neighbours: Channels = ()
+    light: tuple[Channels, ...] = ()
 
 
 def segment_count(length: Float[Array, "rays"], dt: Scalar) -> Int[Array, "rays"]:
@@ -54,4 +69,4 @@ def segment(k: Int[Array, "..."], count: Int[Array, "rays"], length: Float[Array
 def points_at(rays: Rays, ray: Int[Array, "rays"], k: Int[Array, "..."], u: Float[Array, "rays"]) -> Point:
     """The batch of points at distance `u` from the entry."""
     p = tuple(e + u * d for e, d in zip(rays.entry, rays.direction, strict=True))
-    return Point(p, ray, jnp.broadcast_to(k, u.shape))
+    return Point(p, rays.direction, ray, jnp.broadcast_to(k, u.shape))

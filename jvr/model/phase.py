@@ -9,7 +9,7 @@ channels; values have as many components.
 import abc
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jvr.model.by_value import ByValue
 from jvr.model.checks import float_array, require
 from jvr.numerics import divide_or_zero
 from jvr.types import ArrayLike, Channels, Scalar, Triple
@@ -283,11 +284,11 @@ class Mixture(AbstractPhase):
         )
 
 
-def asymmetry(value: ArrayLike, name: str) -> Numbers:
-    """One number or three, of magnitude below 1."""
-    array = float_array(value, name, (), (3,))
+def asymmetry(value: ArrayLike | ByValue, name: str) -> Any:
+    """One number or three, or one by value, of magnitude below 1."""
+    array = value.values if isinstance(value, ByValue) else float_array(value, name, (), (3,))
     require(array, lambda g: np.abs(g) < 1, f"{name} must lie between -1 and 1 without either, such as 0.9999")
-    return array
+    return value if isinstance(value, ByValue) else array
 
 
 def components(*parameters: Numbers) -> tuple[Channels, ...]:

@@ -20,7 +20,7 @@ the next term of Legendre's expansion of `exp(-tau)`, of order `d^5` also. With 
 
 import itertools
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -76,6 +76,7 @@ class PreIntegratedTable(eqx.Module):
     entries: Float[Array, "entries columns"]
     blocks: Float[Array, "blocks means"]
     parts: int = eqx.field(static=True)
+    takes_gradient: ClassVar[bool] = False
 
     def __init__(self, table: LinearTransfer | LutTransfer, parts: int = 1):
         if not isinstance(table, LinearTransfer | LutTransfer):
@@ -90,6 +91,10 @@ class PreIntegratedTable(eqx.Module):
         # Both ends are repeated: outside of the table lies an interval of no width between equal entries.
         self.entries = jnp.pad(jnp.concatenate([x[:, None], table.rgb, sigma_t], axis=1), ((1, 1), (0, 0)), mode="edge")
         self.blocks = _blocks(x, table.rgb, sigma_t)
+
+    def evaluate(self, s: Scalar) -> Classified:
+        """Colour and extinction at one scalar."""
+        return self.table.evaluate(s)
 
     def segment(self, optical: AbstractOpticalModel, s0: Scalar, s1: Scalar, dt: Scalar) -> tuple[Channels, Channels]:
         """Radiance that leaves a segment of length `dt` along which the scalar goes linearly from `s0` to `s1`, and its optical

@@ -1,7 +1,7 @@
 """Transfer functions: from the scalar `s` to colour and extinction."""
 
 import abc
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,10 +25,11 @@ class Classified(NamedTuple):
 class AbstractTransfer(eqx.Module):
     """A map from the scalar `s` (in the data's own units) to source colour and extinction."""
 
-    rgb: eqx.AbstractVar[Float[Array, "n 3"]]
+    # Whether `evaluate` takes the length of the gradient (per world length) as well.
+    takes_gradient: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def evaluate(self, s: Scalar) -> Classified:
+    def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         """Colour and extinction at one scalar value; traceable and differentiable in `s` and in every array."""
 
     @abc.abstractmethod
@@ -39,6 +40,7 @@ class AbstractTransfer(eqx.Module):
 class AbstractTable(AbstractTransfer):
     """A transfer function that interpolates the rows of a table linearly, colour and extinction separately."""
 
+    rgb: eqx.AbstractVar[Float[Array, "n 3"]]
     sigma_t: eqx.AbstractVar[Float[Array, "..."]]
 
     @abc.abstractmethod
@@ -85,7 +87,7 @@ class LinearTransfer(AbstractTable):
         fraction = (jnp.clip(s, low, high) - low) / (high - low)
         return i + fraction
 
-    def evaluate(self, s: Scalar) -> Classified:
+    def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         return _interpolate(self, self.coordinate(s))
 
 
@@ -118,7 +120,7 @@ class LutTransfer(AbstractTable):
         low, high = self.domain[0], self.domain[1]
         return jnp.clip((s - low) * (last / (high - low)), 0, last)
 
-    def evaluate(self, s: Scalar) -> Classified:
+    def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         return _interpolate(self, self.coordinate(s))
 
 
@@ -147,7 +149,7 @@ class GaussianTransfer(AbstractTransfer):
         require(self.width, lambda w: np.isfinite(w) & (w > 0), "width must be positive")
         self.height, self.rgb = _extinction(height, g, "height"), _colour(rgb, g)
 
-    def evaluate(self, s: Scalar) -> Classified:
+    def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         limit = jnp.finfo(self.center.dtype).max
         # Squared below: farther out the square would overflow, and the colour of two overflows is undefined.
         z = jnp.clip((s - self.center) / self.width, -0.5 * limit**0.5, 0.5 * limit**0.5)

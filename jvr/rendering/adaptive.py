@@ -85,6 +85,8 @@ def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
     if not isinstance(scene.volume.interpolation, Trilinear):
         name = type(scene.volume.interpolation).__name__
         raise ValueError(f"jvr.Slices() interpolates between samples, which {name}() volumes do not allow: {UNIFORM}")
+    if scene.shading is not None or scene.scattering is not None:
+        raise ValueError(f"jvr.Slices() does not know light: {UNIFORM}, or take shading and scattering out of the scene")
     if not isinstance(settings.adjoint, Replay):
         raise ValueError(
             f"jvr.Slices() needs Settings(adjoint=jvr.Replay()), not jvr.{type(settings.adjoint).__name__}(): {UNIFORM}"

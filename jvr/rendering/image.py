@@ -1,20 +1,21 @@
 """`jvr.render`: a scene seen by a camera."""
 
 import functools
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.march import Marched, MarchOptions
+from jvr.march.march import AbstractVisibility, Marched, MarchOptions
 from jvr.march.occupancy import Occupancy
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
 from jvr.rendering.parts import in_parts, is_traced
-from jvr.rendering.plan import medium, occupancy
+from jvr.rendering.plan import medium, occupancy, visibility
 from jvr.rendering.sampling import RefinementStats, SliceStats
 from jvr.rendering.settings import Settings
 from jvr.types import Image, Scalar, Triple
@@ -64,15 +65,29 @@ def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> 
     """`render` with every ray and every visible sample."""
     if is_traced((scene, camera)):
         pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
-        where = occupancy(scene, settings)
+        where = seen(scene, settings)
         march = _render_pixels if pixels.size <= settings.tile else _render_tiles
         rgb, alpha, depth, steps = march(scene, camera, settings, where, pixels)
     else:
-        where = _compiled_occupancy(scene, settings)
+        where = _compiled_seen(scene, settings)
         part = functools.partial(_compiled_pixels, scene, camera, settings, where)
         rgb, alpha, depth, steps = in_parts(part, camera.height, camera.width, settings.tile)
     shape = (camera.height, camera.width)
     return Rendering(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape), RenderStats(steps.reshape(shape)))
+
+
+class Seen(NamedTuple):
+    """What is computed once for all rays of a picture: visible bricks, and what shades the lights; `None` for neither."""
+
+    occupancy: Occupancy | None = None
+    shadows: AbstractVisibility | None = None
+
+
+def seen(scene: Scene, settings: Settings) -> Seen:
+    """What rays through a scene need to know beforehand."""
+    (scene,) = one_precision(scene)
+    where = occupancy(scene, settings)
+    return Seen(where, visibility(scene, where))
 
 
 def trace(
@@ -81,7 +96,7 @@ def trace(
     settings: Settings,
     pixels: Int[Array, "rays"],
     *,
-    where: Occupancy | None = None,
+    where: Seen = Seen(),
     distance: bool = False,
 ) -> tuple[Marched, Rays, Float[Array, "rays"]]:
     """Marches the rays of some pixels, only `where` there is something to see; returns what they gathered, the rays, and the distance
@@ -89,17 +104,16 @@ def trace(
     scene, camera = one_precision(scene, camera)
     rays, t_in = enter(scene, *camera.rays(pixels))
     options = MarchOptions(settings.termination, distance)
-    return settings.adjoint.march(options, medium(scene, settings, where), rays, step_length(scene, settings)), rays, t_in
+    return settings.adjoint.march(options, medium(scene, settings, *where), rays, step_length(scene, settings)), rays, t_in
 
 
-def one_precision(scene: Scene, camera: AbstractCamera) -> tuple[Scene, AbstractCamera]:
-    """Every floating-point array in the widest precision among them, as the state of the loop needs; with x64 on, parts of a scene
-    may differ. Voxels stay as they are in memory."""
+def one_precision(scene: Scene, *others: Any) -> Any:
+    """A scene and whatever else with every floating-point array in the widest precision among them, as the state of the loop needs; with
+    x64 on, parts of a scene may differ. Voxels stay as they are in memory."""
     voxels = lambda tree: tree[0].volume.values
-    rest = eqx.tree_at(voxels, (scene, camera), None)
-    floats, others = eqx.partition(rest, eqx.is_inexact_array)
+    floats, rest = eqx.partition(eqx.tree_at(voxels, (scene, *others), None), eqx.is_inexact_array)
     widest = jnp.result_type(*jax.tree.leaves(floats))
-    promoted = eqx.combine(jax.tree.map(lambda x: x.astype(widest), floats), others)
+    promoted = eqx.combine(jax.tree.map(lambda x: x.astype(widest), floats), rest)
     return eqx.tree_at(voxels, promoted, scene.volume.values, is_leaf=lambda x: x is None)
 
 
@@ -143,7 +157,7 @@ def composite(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> 
     return rgb, alpha
 
 
-def _render_pixels(scene: Scene, camera: AbstractCamera, settings: Settings, where: Occupancy | None, pixels: Int[Array, "rays"]):
+def _render_pixels(scene: Scene, camera: AbstractCamera, settings: Settings, where: Seen, pixels: Int[Array, "rays"]):
     gathered, rays, t_in = trace(scene, camera, settings, pixels, where=where, distance=True)
     rgb, alpha = composite(scene, gathered, rays.length)
     weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
@@ -152,7 +166,7 @@ def _render_pixels(scene: Scene, camera: AbstractCamera, settings: Settings, whe
     return jnp.stack(rgb, axis=-1), alpha, depth, gathered.steps
 
 
-def _render_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, where: Occupancy | None, pixels: Int[Array, "rays"]):
+def _render_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, where: Seen, pixels: Int[Array, "rays"]):
     count = -(-pixels.size // settings.tile)
     # The last tile repeats the last pixel; what it computes for it is dropped.
     padded = jnp.minimum(jnp.arange(count * settings.tile, dtype=jnp.int32), pixels.size - 1).reshape(count, settings.tile)
@@ -161,4 +175,4 @@ def _render_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, wher
 
 
 _compiled_pixels = jax.jit(_render_pixels, static_argnums=2)
-_compiled_occupancy = jax.jit(occupancy, static_argnums=1)
+_compiled_seen = jax.jit(seen, static_argnums=1)

@@ -1,53 +1,79 @@
 """What of a scene is in the compiled program, decided from its structure alone."""
 
 import dataclasses
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 from jax.core import Tracer
 
 from jvr.march.fields import VoxelField
-from jvr.march.march import AbstractShader, Medium
+from jvr.march.march import AbstractShader, AbstractVisibility, Medium
 from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.quadrature import PreIntegrated
-from jvr.march.steps import Point
+from jvr.march.shaders import GradientFrame, OpticalShader, PreIntegratedShader
 from jvr.model.bricks import bricks_of
-from jvr.model.optical import AbstractOpticalModel, EmissionOnly
+from jvr.model.light import AbstractLight, AmbientLight
+from jvr.model.normals import AbstractNormals
+from jvr.model.optical import AbsorptionOnly, EmissionOnly
 from jvr.model.preintegration import PreIntegratedTable
 from jvr.model.scene import Scene
-from jvr.model.transfer import Classified
 from jvr.model.volume import Volume
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
-from jvr.types import Channels, Scalar
 
 
-class OpticalShader(AbstractShader):
-    """The optical model alone: an unlit medium."""
+def medium(
+    scene: Scene, settings: Settings, occupancy: Occupancy | None = None, shadows: AbstractVisibility | None = None
+) -> Medium:
+    """What of a scene rays march through: what the scene does not name is not in it."""
+    frame, normals = _gradients(scene)
+    field = VoxelField(scene.volume, normals)
+    quadrature = settings.quadrature
+    pre_integrated = isinstance(quadrature, PreIntegrated)
+    if scene.shading is None and scene.scattering is None:
+        shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
+    else:
+        shader = _lit_shader(scene, frame, pre_integrated)
+    if not isinstance(quadrature, PreIntegrated):
+        return Medium(field, scene.transfer, shader, occupancy, shadows)
+    # Checks the transfer function's type itself.
+    table = PreIntegratedTable(cast(Any, scene.transfer), quadrature.parts)
+    return Medium(field, table, shader, occupancy, shadows)
 
-    optical: AbstractOpticalModel
 
-    def segment(self, medium: Classified, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        return self.optical.segment(medium, dt)
+def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool) -> AbstractShader:
+    from jvr.effects.lighting import LitPreIntegratedShader, LitShader
 
-
-class PreIntegratedShader(OpticalShader):
-    """The optical model alone, the scalar linear along a segment."""
-
-    places: ClassVar[tuple[float, ...]] = (-0.5, 0.5)
-
-    def look(self, transfer: Any, scalars: tuple[Scalar, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        return transfer.segment(self.optical, *scalars, dt)
+    kind = LitPreIntegratedShader if pre_integrated else LitShader
+    ambient = tuple(light for light in scene.lights if isinstance(light, AmbientLight))
+    lights, volume = arriving_lights(scene), scene.volume
+    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering)
 
 
-def medium(scene: Scene, settings: Settings, occupancy: Occupancy | None = None) -> Medium:
-    """What of a scene rays march through."""
-    field = VoxelField(scene.volume)
-    if isinstance(settings.quadrature, PreIntegrated):
-        # Checks the transfer function's type itself.
-        table = PreIntegratedTable(cast(Any, scene.transfer), settings.quadrature.parts)
-        return Medium(field, table, PreIntegratedShader(scene.optical), occupancy)
-    return Medium(field, scene.transfer, OpticalShader(scene.optical), occupancy)
+def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
+    """How gradients come about, where something asks for them."""
+    scatters = scene.scattering is not None and scene.scattering.needs_gradient
+    if scene.shading is None and not scatters and not scene.transfer.takes_gradient:
+        return None, None
+    if scene.normals.of_opacity and scene.transfer.takes_gradient:
+        raise ValueError("a transfer function of the gradient needs that of the scalar: set normals=...(of_opacity=False)")
+    normals = scene.normals.prepared(scene.volume, scene.transfer)
+    return GradientFrame(scene.normals, scene.volume.axes_inverse, scene.volume.shape), normals
+
+
+def arriving_lights(scene: Scene) -> tuple[AbstractLight, ...]:
+    """The lights that come from one direction at each point."""
+    return tuple(light for light in scene.lights if isinstance(light, AbstractLight))
+
+
+def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility | None:
+    """What says how much light reaches a point, or `None` where nothing casts shadows. Made once for a picture."""
+    if scene.shadows is None:
+        return None
+    frame, normals = _gradients(scene) if scene.transfer.takes_gradient else (None, None)
+    absorbing = Medium(VoxelField(scene.volume, normals), scene.transfer, OpticalShader(AbsorptionOnly(), frame), occupancy)
+    return scene.shadows.prepared(scene, arriving_lights(scene), absorbing, jnp.min(scene.volume.spacing))
 
 
 def occupancy(scene: Scene, settings: Settings) -> Occupancy | None:
@@ -106,7 +132,8 @@ def plan(scene: Scene, settings: Settings = Settings()) -> Plan:
     """
     volume, transfer = scene.volume, scene.transfer
     voxels = f"{'x'.join(map(str, volume.shape))} {volume.values.dtype}"
-    coloured = any(getattr(transfer, name, transfer.rgb).ndim == 2 for name in ("sigma_t", "height") if hasattr(transfer, name))
+    arguments = (volume.slope,) * (2 if transfer.takes_gradient else 1)
+    coloured = len(jax.eval_shape(transfer.evaluate, *arguments).sigma_t) == 3
     transparent = isinstance(scene.optical, EmissionOnly)
     termination = f"rays end at transmittance {settings.termination:g}" if settings.termination > 0 else "rays run to their end"
     quadrature = settings.quadrature

@@ -14,13 +14,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.march.march import MarchOptions
-from jvr.march.occupancy import Occupancy
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero
-from jvr.rendering.image import Rendering, RenderStats, composite, enter, one_precision, step_length
+from jvr.rendering.image import Rendering, RenderStats, Seen, composite, enter, one_precision, seen, step_length
 from jvr.rendering.pixels import ImagePlane, image_plane
-from jvr.rendering.plan import medium, occupancy
+from jvr.rendering.plan import medium
 from jvr.rendering.sampling import Refinement, RefinementStats
 from jvr.rendering.settings import Settings
 
@@ -59,7 +58,7 @@ def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sam
     height, width = (-(-(n - 1) // tile) * tile + 1 for n in (camera.height, camera.width))
     row, column = (x.reshape(-1) for x in jnp.meshgrid(*(jnp.arange(n, dtype=jnp.int32) for n in (height, width)), indexing="ij"))
     grid = _Grid(column, row, (height, width))
-    where = occupancy(scene, settings)
+    where = seen(scene, settings)
 
     def refine(picture: _Picture, spacing: Int[Array, ""]) -> tuple[_Picture, Int[Array, "pixels"]]:
         fine, coarse = (~((row % s > 0) | (column % s > 0)) for s in (spacing, 2 * spacing))
@@ -90,7 +89,7 @@ def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sam
 
 
 def _trace(
-    scene: Scene, plane: ImagePlane, settings: Settings, where: Occupancy | None, grid: _Grid, mask: Bool[Array, "pixels"]
+    scene: Scene, plane: ImagePlane, settings: Settings, where: Seen, grid: _Grid, mask: Bool[Array, "pixels"]
 ) -> tuple[Float[Array, "pixels 5"], Int[Array, "pixels"]]:
     """Colour, opacity and opacity-weighted depth of the pixels of a mask, and their steps."""
     column, row = (x.astype(scene.volume.slope.dtype) for x in (grid.column, grid.row))
@@ -98,7 +97,7 @@ def _trace(
     # A ray without length is not marched.
     rays = rays._replace(length=jnp.where(mask, rays.length, 0.0))
     options = MarchOptions(settings.termination, True)
-    gathered = settings.adjoint.march(options, medium(scene, settings, where), rays, step_length(scene, settings))
+    gathered = settings.adjoint.march(options, medium(scene, settings, *where), rays, step_length(scene, settings))
     rgb, alpha = composite(scene, gathered, rays.length)
     weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
     assert gathered.steps is not None

@@ -1,0 +1,154 @@
+"""Deep shadow maps: transmittance along each of the light's rays as few straight pieces (Lokovic and Veach 2000)."""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jvr.effects.light_space import AbstractLightSpace, bilinear, depth_nodes, light_space
+from jvr.effects.shadow_volume import check_size
+from jvr.march.march import AbstractVisibility, Medium
+from jvr.march.steps import Point
+from jvr.model.effects import AbstractShadows
+from jvr.model.light import AbstractLight
+from jvr.model.scene import Scene
+from jvr.numerics import read_run, transformed
+from jvr.types import Affine, Channels, Scalar, Triple
+
+
+class DeepShadowMap(AbstractShadows):
+    """A map of rays, along each of which transmittance is kept as at most `layers` straight pieces.
+
+    A piece goes on as long as the straight line from its start through the transmittance at its end stays within `error` of all that it
+    passes. Where `layers` pieces do not suffice, the last one goes straight to the end of the ray, with an error that nothing bounds:
+    `rendering.stats.shadows` says what share of the rays that were, and the largest error of any.
+
+    **Arguments:** `texels`: rays along each axis of the map; `layers`: pieces of each, at least 1; `error`: of transmittance, above 0.
+
+    For directional and point (spot) lights. Differentiable in transfer function, voxels, lights and pose through the transmittances where
+    pieces meet; detached: where along a ray that is. Memory: `8 texels^2 (layers + 1)` bytes for each channel of extinction; while it is
+    made, 4 bytes for each voxel of the volume's diagonal and ray.
+    """
+
+    texels: int = eqx.field(static=True)
+    layers: int = eqx.field(static=True)
+    error: float = eqx.field(static=True)
+
+    def __init__(self, texels: int = 128, layers: int = 12, *, error: float = 0.01):
+        check_size(texels, "texels", 2)
+        check_size(layers, "layers", 1)
+        if not isinstance(error, float) or not 0 < error < 1:
+            raise ValueError(f"error must be a difference of transmittance above 0 and below 1, not {error!r}")
+        self.texels, self.layers, self.error = texels, layers, error
+
+    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+        steps = max(self.layers, math.ceil(math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape))))
+        maps = []
+        for light in lights:
+            space = light_space(light, scene.volume) if light.casts_shadows else None
+            if space is None:
+                maps.append(None)
+                continue
+            clear = jnp.exp(-depth_nodes(space, scene, medium, self.texels, steps, 1))
+            maps.append(_deep_map(space, clear, self.layers, self.error))
+        return DeepVisibility(scene.volume.world_from_grid, tuple(maps))
+
+
+class ShadowStats(NamedTuple):
+    """How well the pieces of a deep shadow map follow the transmittance: the share of rays that ran out of pieces, and the largest error
+    along any ray."""
+
+    overflow: Scalar
+    error: Scalar
+
+
+class DeepMap(eqx.Module):
+    """For each ray of a light, the depths `w` where pieces meet and the transmittances there."""
+
+    space: AbstractLightSpace
+    depths: Float[Array, "u v nodes channels"]
+    clear: Float[Array, "u v nodes channels"]
+    stats: ShadowStats
+
+    def transmittance(self, x: Triple) -> Channels:
+        """At a world position: along each of the four rays around it, then bilinearly."""
+        texels, _, nodes, channels = self.depths.shape
+        u, v, w = self.space.place(x)
+        depths, clear = self.depths.reshape(-1, channels), self.clear.reshape(-1, channels)
+        total = [jnp.zeros_like(u)] * channels
+        for texel, weight in bilinear(texels, u, v):
+            z, T = read_run(depths, texel * nodes, nodes), read_run(clear, texel * nodes, nodes)
+            total = [t + weight * _along(z[:, c], T[:, c], w) for c, t in enumerate(total)]
+        return tuple(total)
+
+
+class DeepVisibility(AbstractVisibility):
+    """A deep map for each light, or `None` for those that nothing shades."""
+
+    world_from_grid: Affine
+    maps: tuple[DeepMap | None, ...]
+
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
+        x = transformed(self.world_from_grid, points.p)
+        return tuple(() if deep is None else jax.vmap(deep.transmittance)(x) for deep in self.maps)
+
+    @property
+    def stats(self) -> ShadowStats:
+        """The worst of all maps."""
+        found = [deep.stats for deep in self.maps if deep is not None]
+        return ShadowStats(*(jnp.max(jnp.stack(values)) for values in zip(*found, strict=True)))
+
+
+def _along(z: Float[Array, "nodes"], T: Float[Array, "nodes"], w: Scalar) -> Scalar:
+    """A piecewise linear function; constant beyond its ends. Pieces that were not needed have no length."""
+    value = T[0]
+    for k in range(z.shape[0] - 1):
+        length = z[k + 1] - z[k]
+        share = jnp.clip((w - z[k]) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
+        value += jnp.where(length > 0, share, 0.0) * (T[k + 1] - T[k])
+    return value
+
+
+def _deep_map(space: AbstractLightSpace, clear: Float[Array, "u v steps channels"], layers: int, error: float) -> DeepMap:
+    u, v, n, channels = clear.shape
+    rays = jnp.moveaxis(clear, -1, 2).reshape(-1, n)
+    nodes = jax.vmap(lambda T: _pieces(T, layers, error))(jax.lax.stop_gradient(rays))
+    z = nodes / (n - 1)
+    T = jnp.take_along_axis(rays, nodes, axis=1)
+    there = jnp.arange(n, dtype=z.dtype) / (n - 1)
+    found = jax.vmap(lambda z, T: jax.vmap(lambda w: _along(z, T, w))(there))(z, jax.lax.stop_gradient(T))
+    worst = jnp.max(jnp.abs(found - jax.lax.stop_gradient(rays)), axis=1)
+    stats = ShadowStats(jnp.mean(worst > error * (1 + 1e-3)), jnp.max(worst))
+    place = lambda a: jnp.moveaxis(a.reshape(u, v, channels, layers + 1), 2, -1)
+    return DeepMap(space, place(z.astype(clear.dtype)), place(T), stats)
+
+
+def _pieces(T: Float[Array, "steps"], layers: int, error: float) -> Int[Array, "nodes"]:
+    """Indices where pieces meet, `layers + 1` of them: from 0 to the last, which is repeated where fewer suffice.
+
+    `lower` and `upper` bound the slopes of lines from the start of the piece that have passed all so far within the error.
+    """
+    n = T.shape[0]
+    wide = (jnp.asarray(-jnp.inf, T.dtype), jnp.asarray(jnp.inf, T.dtype))
+
+    def window(start: Int[Array, ""], k: Int[Array, ""]) -> tuple[Scalar, Scalar, Scalar]:
+        run, rise = (k - start).astype(T.dtype), T[k] - T[start]
+        return (rise - error) / run, rise / run, (rise + error) / run
+
+    def step(carry, k):
+        nodes, count, start, lower, upper = carry
+        _, slope, _ = window(start, k)
+        # A line that ends at k must have passed all before it; where it would not, the piece ends one sooner.
+        ends = ((slope < lower) | (slope > upper)) & (count < layers)
+        nodes = jnp.where(ends, nodes.at[count].set(k - 1), nodes)
+        count, start = count + ends, jnp.where(ends, k - 1, start)
+        lower, upper = (jnp.where(ends, bound, old) for bound, old in zip(wide, (lower, upper), strict=True))
+        low, _, high = window(start, k)
+        return (nodes, count, start, jnp.maximum(lower, low), jnp.minimum(upper, high)), None
+
+    nodes = jnp.full(layers + 1, n - 1, jnp.int32).at[0].set(0)
+    (nodes, *_), _ = jax.lax.scan(step, (nodes, jnp.int32(1), jnp.int32(0), *wide), jnp.arange(1, n, dtype=jnp.int32))
+    return nodes

@@ -1,0 +1,91 @@
+"""The light at a sample, and what it adds to the medium's own: `j = sigma_t (rgb a + b)`.
+
+`a` is what shading makes of the light (1 without shading), `b` what is reflected in the light's own colour and what is scattered:
+
+    a = k_ambient L_ambient + sum_lights E T_light reflect,    b = sum_lights E T_light (specular + albedo p(cos theta)).
+
+Lights, shading, shadows and scattering of the scene come together here; each says for itself what it does.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jvr.march.shaders import OpticalShader, PreIntegratedShader
+from jvr.march.steps import Point, Sample
+from jvr.model.by_value import at_value
+from jvr.model.effects import AbstractScattering, AbstractShading
+from jvr.model.light import AbstractLight, AmbientLight
+from jvr.model.transfer import Classified
+from jvr.numerics import direction_and_length, transformed, turned
+from jvr.types import Affine, Channels, Scalar, Triple
+
+
+class LitShader(OpticalShader):
+    """The optical model of a medium that shows light."""
+
+    world_from_grid: Affine
+    lights: tuple[AbstractLight, ...]
+    ambient: tuple[AmbientLight, ...]
+    shading: AbstractShading | None
+    scattering: AbstractScattering | None
+
+    def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        factor, added = self.light_at(sample, point)
+        rgb = tuple(c * a + b for c, a, b in zip(medium.rgb, factor, added, strict=True))
+        return self.optical.segment(Classified(rgb, medium.sigma_t), dt)
+
+    def light_at(self, sample: Sample, point: Point) -> tuple[Triple, Triple]:
+        """`a` and `b` of a sample."""
+        zero = jnp.zeros_like(sample.s)
+        x = transformed(self.world_from_grid, point.p)
+        w_o, _ = direction_and_length(turned(-self.world_from_grid[:3, :3], point.direction))
+        shading, scattering = at_value((self.shading, self.scattering), sample.s)
+        normal, magnitude = direction_and_length(tuple(-g for g in sample.gradient)) if sample.gradient else ((zero,) * 3, zero)
+        surface = zero if shading is None else shading.surface_share(magnitude)
+        scatters = zero + 1 if scattering is None or not scattering.needs_gradient else scattering.share(magnitude)
+        # Where there is a switch, what is not a surface scatters and does not reflect.
+        reflects = 1 - scatters if scattering is not None and scattering.needs_gradient else zero + 1
+        factor, added = [zero if shading is not None else zero + 1] * 3, [zero] * 3
+        for light, transmittance in zip(self.lights, sample.light or ((),) * len(self.lights), strict=True):
+            towards, _, irradiance = light.arrives(x, w_o)
+            arriving = _times(irradiance, transmittance)
+            if shading is not None:
+                diffuse, specular = shading.reflect(surface, normal, w_o, towards)
+                factor = [f + reflects * diffuse * e for f, e in zip(factor, arriving, strict=True)]
+                if specular is not None:
+                    added = [b + reflects * specular * e for b, e in zip(added, arriving, strict=True)]
+            if scattering is not None:
+                scattered = _times(arriving, scattering.scatter(w_o, towards))
+                added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
+        for light in self.ambient:
+            if shading is not None:
+                factor = [f + reflects * shading.ambient_share() * e for f, e in zip(factor, light.rgb, strict=True)]
+            if scattering is not None:
+                scattered = _times(light.rgb, scattering.scatter_ambient())
+                added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
+        return tuple(factor), tuple(added)
+
+
+class LitPreIntegratedShader(LitShader, PreIntegratedShader):
+    """The scalar linear along a segment, the light that of the mean of its ends."""
+
+    def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        front, back = samples
+        emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
+        factor, added = self.light_at(self.prepare(transfer, _mean(front, back), point), point)
+        # A constant colour of the given optical depth.
+        extra, _ = self.optical.segment(Classified(added, dtau), jnp.ones_like(dt))
+        return tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False)), dtau
+
+
+def _mean(front: Sample, back: Sample) -> Sample:
+    return jax.tree.map(lambda a, b: 0.5 * (a + b), front, back)
+
+
+def _times(rgb: Triple, channels: Channels) -> Triple:
+    """Three channels times one, three or none."""
+    if not channels:
+        return rgb
+    return tuple(c * f for c, f in zip(rgb, channels * (3 // len(channels)), strict=True))

@@ -1,0 +1,78 @@
+"""Single scattering: light that the medium scatters once on its way to the eye (course notes on GPU-based volume ray-casting,
+Eurographics 2009, chapters 7.1 to 7.4)."""
+
+from typing import Any
+
+import numpy as np
+
+from jvr.effects.shading import share_of
+from jvr.model.by_value import ByValue, coefficient
+from jvr.model.checks import float_array, require
+from jvr.model.effects import AbstractScattering
+from jvr.model.phase import AbstractPhase, Isotropic, ScatteringAngle
+from jvr.types import ArrayLike, Channels, Scalar, Triple
+
+
+class SingleScattering(AbstractScattering):
+    """Scattered emission `j = sigma_t albedo p(cos theta) E T_light`, added to the medium's own.
+
+    **Arguments:**
+
+    - `phase`: a phase function, such as `jvr.HenyeyGreenstein(g)`; a `jvr.ByValue` as its `g` makes it depend on the scalar.
+    - `albedo`: share of extinguished light that is scattered, 0 ... 1; a number, `(3,)`, or `jvr.ByValue`.
+    - `threshold`: with one, light is scattered where the gradient is weak and reflected (`Scene(shading=...)`) where it is strong (notes,
+      section 7.4.4): with a gradient of length `m` the share `threshold^2 / (m^2 + threshold^2)` scatters, and what remains
+      reflects. `None`: everything scatters, surface or not.
+
+    With lights of unknown intensity, only the product of albedo and intensity can be seen in a picture. Differentiable in all numbers.
+    """
+
+    phase: AbstractPhase
+    albedo: Any
+    threshold: Scalar | None
+
+    def __init__(
+        self,
+        phase: AbstractPhase = Isotropic(),
+        albedo: ArrayLike | ByValue = 1.0,
+        *,
+        threshold: ArrayLike | None = None,
+    ):
+        if not isinstance(phase, AbstractPhase):
+            raise TypeError(f"phase must be a phase function such as jvr.HenyeyGreenstein(0.5), not {type(phase).__name__}")
+        self.phase = phase
+        valid, message = lambda a: (a >= 0) & (a <= 1), "albedo must be a share of the extinguished light, 0 to 1"
+        if not isinstance(albedo, ByValue) and np.ndim(albedo) == 1:
+            self.albedo = float_array(albedo, "albedo", (3,))
+            require(self.albedo, valid, message)
+        else:
+            self.albedo = coefficient(albedo, "albedo", valid, message)
+        self.threshold = None if threshold is None else float_array(threshold, "threshold", ())
+        if threshold is not None:
+            positive = lambda t: np.isfinite(t) & (t > 0)
+            require(self.threshold, positive, "threshold must be a positive length of the gradient, or None")
+
+    @property
+    def needs_gradient(self) -> bool:
+        return self.threshold is not None
+
+    def share(self, magnitude: Scalar) -> Scalar:
+        assert self.threshold is not None
+        return 1 - share_of(magnitude, self.threshold)
+
+    def scatter(self, w_o: Triple, w_i: Triple) -> Channels:
+        phase = self.phase.evaluate(ScatteringAngle.between(w_o, w_i))
+        return _times(phase, self._albedo())
+
+    def scatter_ambient(self) -> Channels:
+        # The integral of a phase function over the sphere is 1.
+        return self._albedo()
+
+    def _albedo(self) -> Channels:
+        return (self.albedo,) if self.albedo.ndim == 0 else (self.albedo[0], self.albedo[1], self.albedo[2])
+
+
+def _times(a: Channels, b: Channels) -> Channels:
+    """Products of one or three channels each."""
+    n = max(len(a), len(b))
+    return tuple(x * y for x, y in zip(a * (n // len(a)), b * (n // len(b)), strict=True))

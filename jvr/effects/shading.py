@@ -1,0 +1,138 @@
+"""Shading: what a surface reflects of the light that falls on it (Phong 1975; Blinn 1977; course notes on GPU-based volume ray-casting,
+Eurographics 2009, section 3.4).
+
+The normal points from larger to smaller values. Visualization convention: a light of irradiance 1 that a surface faces returns the
+colour of the transfer function; the cosine is that of the angle between normal and light.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jvr.model.by_value import ByValue, coefficient
+from jvr.model.checks import float_array, require
+from jvr.model.effects import AbstractShading
+from jvr.numerics import direction_and_length, dot
+from jvr.types import ArrayLike, Scalar, Triple
+
+
+class Lambert(AbstractShading):
+    """Matte surfaces: `ambient L_ambient + diffuse E max(n . w_i, 0)`, times the colour of the medium.
+
+    **Arguments:**
+
+    - `ambient`, `diffuse`: numbers, not negative, or `jvr.ByValue` for a material by scalar.
+    - `threshold`: length of the gradient (data units per world length) of half a surface: a point with a gradient of length `m` is one
+      by the share `m^2 / (m^2 + threshold^2)`; the rest of it reflects as if it faced the light, so that homogeneous regions are not
+      shaded as surfaces. 0: whatever has a gradient is a surface.
+    - `two_sided`: the normal is turned to the eye; else the side of larger values is dark.
+
+    Differentiable in all numbers; detached: which way a normal is turned.
+    """
+
+    ambient: Any
+    diffuse: Any
+    threshold: Scalar
+    two_sided: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        ambient: ArrayLike | ByValue = 1.0,
+        diffuse: ArrayLike | ByValue = 1.0,
+        *,
+        threshold: ArrayLike = 0.0,
+        two_sided: bool = True,
+    ):
+        self.ambient = _share(ambient, "ambient")
+        self.diffuse = _share(diffuse, "diffuse")
+        self.threshold = float_array(threshold, "threshold", ())
+        require(self.threshold, lambda t: np.isfinite(t) & (t >= 0), "threshold must be a length of the gradient, not negative")
+        self.two_sided = two_sided
+
+    def ambient_share(self) -> Scalar:
+        return self.ambient
+
+    def surface_share(self, magnitude: Scalar) -> Scalar:
+        return share_of(magnitude, self.threshold)
+
+    def reflect(self, share: Scalar, normal: Triple, w_o: Triple, w_i: Triple) -> tuple[Scalar, Scalar | None]:
+        normal = self._turned(normal, w_o)
+        facing = jnp.maximum(dot(normal, w_i), 0.0)
+        diffuse = self.diffuse * (1 + share * (facing - 1))
+        gloss = self.gloss(normal, w_o, w_i)
+        return diffuse, None if gloss is None else share * jnp.where(facing > 0, gloss, 0.0)
+
+    def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
+        """What is reflected in the colour of the light."""
+        return None
+
+    def _turned(self, normal: Triple, w_o: Triple) -> Triple:
+        if not self.two_sided:
+            return normal
+        sign = jnp.where(dot(normal, w_o) < 0, -1.0, 1.0)
+        return tuple(sign * c for c in normal)
+
+
+class Phong(Lambert):
+    """Glossy surfaces: Lambert's, and `specular E max(r . w_o, 0)^shininess` in the colour of the light, with `r` the mirrored light.
+
+    **Arguments:** as `Lambert`, and `specular`, not negative; `shininess`, at least 1. Each a number or `jvr.ByValue`.
+    """
+
+    specular: Any
+    shininess: Any
+
+    def __init__(
+        self,
+        ambient: ArrayLike | ByValue = 0.1,
+        diffuse: ArrayLike | ByValue = 0.7,
+        specular: ArrayLike | ByValue = 0.3,
+        shininess: ArrayLike | ByValue = 30.0,
+        *,
+        threshold: ArrayLike = 0.0,
+        two_sided: bool = True,
+    ):
+        super().__init__(ambient, diffuse, threshold=threshold, two_sided=two_sided)
+        self.specular = _share(specular, "specular")
+        at_least_1 = lambda e: np.isfinite(e) & (e >= 1)
+        self.shininess = coefficient(shininess, "shininess", at_least_1, "shininess must be an exponent of at least 1")
+
+    def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
+        twice = 2 * dot(normal, w_i)
+        mirrored = tuple(twice * n - w for n, w in zip(normal, w_i, strict=True))
+        return self.specular * power_of_cosine(mirrored, w_o, self.shininess)
+
+
+class BlinnPhong(Phong):
+    """As `Phong` with `specular E max(n . h, 0)^shininess`, `h` half-way between the directions to eye and light."""
+
+    def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
+        half, length = direction_and_length(tuple(o + i for o, i in zip(w_o, w_i, strict=True)))
+        return jnp.where(length > 0, self.specular * power_of_cosine(normal, half, self.shininess), 0.0)
+
+
+def power_of_cosine(a: Triple, b: Triple, exponent: Scalar) -> Scalar:
+    """`max(a . b, 0)^exponent` of unit vectors.
+
+    As `(1 - |a - b|^2 / 2)^exponent`: near the peak the cosine has no digits left that a large exponent could magnify.
+    """
+    gap = 0.5 * sum(jnp.square(x - y) for x, y in zip(a, b, strict=True))
+    # At a right angle the power is zero, and so is its derivative, or taken as such where the exponent is 1.
+    positive = gap < 1
+    return jnp.where(positive, jnp.exp(exponent * jnp.log1p(-jnp.where(positive, gap, 0.0))), 0.0)
+
+
+def share_of(magnitude: Scalar, threshold: Scalar) -> Scalar:
+    """`m^2 / (m^2 + t^2)`, by the ratio of the smaller to the larger, so that no square overflows; 0 where `m` is 0."""
+    larger, smaller = jnp.maximum(magnitude, threshold), jnp.minimum(magnitude, threshold)
+    ratio = jnp.square(smaller / jnp.where(larger > 0, larger, 1.0))
+    share = jnp.where(magnitude >= threshold, 1 / (1 + ratio), ratio / (1 + ratio))
+    # A gradient that vanishes has no normal, whatever the threshold.
+    return jnp.where(magnitude > 0, share, jax.lax.stop_gradient(jnp.zeros_like(magnitude)))
+
+
+def _share(value: ArrayLike | ByValue, name: str) -> Any:
+    return coefficient(value, name, lambda v: np.isfinite(v) & (v >= 0), f"{name} must be finite and not negative")

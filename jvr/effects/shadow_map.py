@@ -1,0 +1,103 @@
+"""Shadow maps: how far light comes before it meets something opaque (Williams 1978; Reeves, Salesin and Cook 1987 for the filter)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jvr.effects.light_space import AbstractLightSpace, depth_nodes, light_space
+from jvr.effects.shadow_volume import check_size, samples_a_layer
+from jvr.march.march import AbstractVisibility, Medium
+from jvr.march.steps import Point
+from jvr.model.effects import AbstractShadows
+from jvr.model.light import AbstractLight
+from jvr.model.scene import Scene
+from jvr.numerics import transformed
+from jvr.types import Affine, Channels, Scalar, Triple
+
+# Layers in which the depth of an occluder is looked for; inside of one it is interpolated.
+LAYERS = 256
+
+
+class ShadowMap(AbstractShadows):
+    """A map of the depth at which each of the light's rays has lost `threshold` of its light: what is behind is dark.
+
+    For opaque occluders only. It does not converge to `ShadowRays` in translucent media, whatever the map's size: light is there or not,
+    and what is half-way through a cloud has a hard shadow. It has no useful gradient: both depths and comparison are detached, so that
+    nothing about the occluder can be fitted through it.
+
+    **Arguments:** `texels`: rays along each axis of the map; `threshold`: opacity of an occluder, above 0, below 1; `softness`: the
+    comparison is averaged over `(2 softness + 1)^2` texels around a point (percentage-closer filtering), with bilinear weights; `bias`:
+    depth in voxels that a point must be behind the map to be dark, against shadows of a surface on itself.
+    """
+
+    texels: int = eqx.field(static=True)
+    threshold: float = eqx.field(static=True)
+    softness: int = eqx.field(static=True)
+    bias: float = eqx.field(static=True)
+
+    def __init__(self, texels: int = 256, *, threshold: float = 0.5, softness: int = 1, bias: float | int = 1.5):
+        check_size(texels, "texels", 2)
+        check_size(softness, "softness", 0)
+        if not isinstance(threshold, float) or not 0 < threshold < 1:
+            raise ValueError(f"threshold must be an opacity above 0 and below 1, not {threshold!r}")
+        if not isinstance(bias, int | float) or not 0 <= bias < float("inf"):
+            raise ValueError(f"bias must be a depth in voxels, not negative, not {bias!r}")
+        self.texels, self.threshold, self.softness, self.bias = texels, threshold, softness, float(bias)
+
+    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+        maps = []
+        for light in lights:
+            space = light_space(light, scene.volume) if light.casts_shadows else None
+            maps.append(None if space is None else self._map(space, scene, medium, spacing))
+        return jax.lax.stop_gradient(MapVisibility(scene.volume.world_from_grid, tuple(maps), self.softness))
+
+    def _map(self, space: AbstractLightSpace, scene: Scene, medium: Medium, spacing: Scalar) -> "DepthMap":
+        nodes = depth_nodes(space, scene, medium, self.texels, LAYERS, samples_a_layer(scene, LAYERS))
+        # The clearest channel decides: an occluder holds all of them back.
+        tau = jnp.min(nodes, axis=-1)
+        depth = jnp.log1p(-jnp.asarray(self.threshold, tau.dtype))
+        first = jnp.sum(tau < -depth, axis=-1)
+        before = jnp.take_along_axis(tau, jnp.maximum(first - 1, 0)[..., None], axis=-1)[..., 0]
+        behind = jnp.take_along_axis(tau, jnp.minimum(first, LAYERS)[..., None], axis=-1)[..., 0]
+        fraction = jnp.where(behind > before, (-depth - before) / jnp.where(behind > before, behind - before, 1.0), 0.0)
+        w = jnp.where(first > LAYERS, jnp.inf, (first - 1 + fraction) / LAYERS)
+        _, _, length = space.ray(jnp.zeros_like(spacing), jnp.zeros_like(spacing))
+        return DepthMap(space, w + self.bias * spacing / length)
+
+
+class DepthMap(eqx.Module):
+    """The depth `w` from which on each ray of a light is dark, infinite where it never is."""
+
+    space: AbstractLightSpace
+    depths: Float[Array, "u v"]
+
+    def lit_share(self, x: Triple, softness: int) -> Scalar:
+        """Share of the texels around a world position whose light reaches it."""
+        texels = self.depths.shape[0]
+        u, v, w = self.space.place(x)
+        at = [jnp.clip((c + 1) / 2 * (texels - 1), 0, texels - 1) for c in (u, v)]
+        low = [jnp.clip(jnp.floor(c), 0, texels - 2) for c in at]
+        fraction = [c - b for c, b in zip(at, low, strict=True)]
+        # A box of 2 softness + 1 texels that slides with the point: its ends are weighted.
+        weight = lambda k, f: jnp.where(k == -softness, 1 - f, jnp.where(k == softness + 1, f, 1.0))
+        total = jnp.zeros_like(w)
+        for a in range(-softness, softness + 2):
+            for b in range(-softness, softness + 2):
+                i, j = (jnp.clip(base.astype(jnp.int32) + k, 0, texels - 1) for base, k in zip(low, (a, b), strict=True))
+                lit = (w < self.depths[i, j]).astype(w.dtype)
+                total += lit * weight(a, fraction[0]) * weight(b, fraction[1])
+        return total / (2 * softness + 1) ** 2
+
+
+class MapVisibility(AbstractVisibility):
+    """A map for each light, or `None` for those that nothing shades."""
+
+    world_from_grid: Affine
+    maps: tuple[DepthMap | None, ...]
+    softness: int = eqx.field(static=True)
+
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
+        x = jax.lax.stop_gradient(transformed(self.world_from_grid, points.p))
+        share = lambda depths: jax.vmap(lambda x: depths.lit_share(x, self.softness))(x)
+        return tuple(() if depths is None else (share(depths),) for depths in self.maps)

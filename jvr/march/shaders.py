@@ -1,0 +1,57 @@
+"""Shaders that know nothing but the optical model: an unlit medium."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jvr.march.march import AbstractShader
+from jvr.march.steps import Point, Sample
+from jvr.model.normals import AbstractNormals
+from jvr.model.optical import AbstractOpticalModel
+from jvr.model.transfer import Classified
+from jvr.numerics import direction_and_length
+from jvr.types import Channels, Scalar
+
+
+class GradientFrame(eqx.Module):
+    """Takes what the field resampled to a gradient in the world: `axes_inverse` is that of the volume, `shape` its voxels."""
+
+    normals: AbstractNormals
+    axes_inverse: Float[Array, "3 3"]
+    shape: tuple[int, int, int] = eqx.field(static=True)
+
+    def in_world(self, transfer: Any, sample: Sample, point: Point) -> Sample:
+        """The sample with its gradient per world length, along the world's axes."""
+        along = self.normals.gradient(transfer, self.shape, point.p, (sample.s, sample.gradient, sample.neighbours))
+        world = tuple(sum((self.axes_inverse[j, i] * along[j] for j in range(3)), jnp.zeros_like(sample.s)) for i in range(3))
+        return sample._replace(gradient=world, neighbours=())
+
+
+class OpticalShader(AbstractShader):
+    """The optical model alone. `frame` is there where something asks for the gradient, the transfer function for example."""
+
+    optical: AbstractOpticalModel
+    frame: GradientFrame | None
+
+    def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        return self.optical.segment(medium, dt)
+
+    def prepare(self, transfer: Any, sample: Sample, point: Point) -> Sample:
+        return sample if self.frame is None else self.frame.in_world(transfer, sample, point)
+
+    def classify(self, transfer: Any, sample: Sample) -> Classified:
+        if not transfer.takes_gradient:
+            return transfer.evaluate(sample.s)
+        return transfer.evaluate(sample.s, direction_and_length(sample.gradient)[1])
+
+
+class PreIntegratedShader(OpticalShader):
+    """The optical model alone, the scalar linear along a segment."""
+
+    places: ClassVar[tuple[float, ...]] = (-0.5, 0.5)
+
+    def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        front, back = samples
+        return transfer.segment(self.optical, front.s, back.s, dt)

@@ -1,0 +1,56 @@
+"""What effects promise, so that a scene can hold them and no module of theirs is imported where it does not."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+
+from jvr.model.light import AbstractLight
+from jvr.types import Channels, Scalar, Triple
+
+
+class AbstractShading(eqx.Module):
+    """How a surface reflects light."""
+
+    @abc.abstractmethod
+    def ambient_share(self) -> Scalar:
+        """Reflected share of ambient radiance."""
+
+    @abc.abstractmethod
+    def surface_share(self, magnitude: Scalar) -> Scalar:
+        """How far a point whose gradient has this length is a surface, 0 ... 1; the rest reflects light as if it faced it."""
+
+    @abc.abstractmethod
+    def reflect(self, share: Scalar, normal: Triple, w_o: Triple, w_i: Triple) -> tuple[Scalar, Scalar | None]:
+        """Radiance towards `w_o` per irradiance from `w_i`: what the colour of the medium is multiplied with, and what is added to that
+        in the colour of the light (`None` for nothing)."""
+
+
+class AbstractScattering(eqx.Module):
+    """How the medium scatters light."""
+
+    @property
+    @abc.abstractmethod
+    def needs_gradient(self) -> bool:
+        """Whether `share` asks for the length of the gradient."""
+
+    @abc.abstractmethod
+    def share(self, magnitude: Scalar) -> Scalar:
+        """How far a point whose gradient has this length is a medium and not a surface, 0 ... 1."""
+
+    @abc.abstractmethod
+    def scatter(self, w_o: Triple, w_i: Triple) -> Channels:
+        """Scattered radiance per unit of optical depth and irradiance from `w_i`, `albedo p(cos theta)`; one or three channels."""
+
+    @abc.abstractmethod
+    def scatter_ambient(self) -> Channels:
+        """The same per unit of a radiance that comes from everywhere."""
+
+
+class AbstractShadows(eqx.Module):
+    """A way to find the transmittance between lights and points."""
+
+    @abc.abstractmethod
+    def prepared(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
+        """A `jvr.march.march.AbstractVisibility` of these lights, made once for a picture; differentiable. `medium`: what light passes
+        through, a `jvr.march.march.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""

@@ -1,0 +1,98 @@
+"""Transfer functions of the scalar and of the length of its gradient (Kniss, Kindlmann and Hansen 2002; Levoy 1988)."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jvr.model.checks import float_array, require
+from jvr.model.transfer import AbstractTransfer, Classified
+from jvr.types import ArrayLike, Channels, Scalar
+
+
+class GradientTransfer(AbstractTransfer):
+    """A table over the scalar and the length of its gradient, bilinear: materials by value, boundaries between them by gradient.
+
+    **Arguments:** `rgb`: `(n, m, 3)`, linear; `sigma_t`: `(n, m)` or, coloured, `(n, m, 3)`, per world length, not negative; `domain`:
+    `(low, high)` scalars of the first and last row; `magnitudes`: `(low, high)` lengths of the gradient, in data units per world length,
+    of the first and last column. Values outside count as at the border. All differentiable.
+    **Raises** `ValueError` for other shapes and ranges.
+    """
+
+    takes_gradient: ClassVar[bool] = True
+
+    rgb: Float[Array, "n m 3"]
+    sigma_t: Float[Array, "..."]
+    domain: Float[Array, "2"]
+    magnitudes: Float[Array, "2"]
+
+    def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike, magnitudes: ArrayLike):
+        self.rgb = float_array(rgb, "rgb", (None, None, 3))
+        n, m, _ = self.rgb.shape
+        if n < 2 or m < 2:
+            raise ValueError(f"a GradientTransfer needs at least 2 x 2 entries, not {n} x {m}")
+        require(self.rgb, np.isfinite, "rgb must be finite")
+        self.sigma_t = float_array(sigma_t, "sigma_t", (n, m), (n, m, 3))
+        require(self.sigma_t, lambda v: np.isfinite(v) & (v >= 0), "sigma_t must be finite and not negative")
+        increasing = lambda d: np.isfinite(d) & (d[0] < d[1])
+        self.domain = float_array(domain, "domain", (2,))
+        self.magnitudes = float_array(magnitudes, "magnitudes", (2,))
+        require(self.domain, increasing, "domain must be (low, high) with low < high")
+        require(self.magnitudes, increasing, "magnitudes must be (low, high) with low < high")
+
+    def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
+        assert magnitude is not None
+        n, m, _ = self.rgb.shape
+        table = jnp.concatenate([self.rgb, self.sigma_t.reshape(n, m, -1)], axis=-1)
+        (i, x), (j, y) = _cell(s, self.domain, n), _cell(magnitude, self.magnitudes, m)
+        rows = [table[i + a, j + b] * ((x if a else 1 - x) * (y if b else 1 - y)) for a in (0, 1) for b in (0, 1)]
+        r, g, b, *sigma_t = sum(rows[1:], rows[0])
+        return Classified((r, g, b), tuple(sigma_t))
+
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
+        n = self.rgb.shape[0]
+        lit = jnp.any(~(jnp.abs(self.sigma_t.reshape(n, -1)) <= least), axis=1)
+        before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(lit, dtype=jnp.int32)])
+        first, last = (_cell(s, self.domain, n)[0] for s in (low, high))
+        return before[jnp.minimum(last + 2, n)] > before[first]
+
+
+class GradientOpacity(AbstractTransfer):
+    """Another transfer function whose extinction is scaled by the length of the gradient: none at `low` and below, all of it from `high`
+    on, linear in between. It shows boundaries and hides what is homogeneous.
+
+    **Arguments:** `transfer`: of the scalar alone; `low`, `high`: lengths of the gradient in data units per world length. Differentiable.
+    **Raises** `ValueError` unless `0 <= low < high`, `TypeError` for a transfer function that takes the gradient already.
+    """
+
+    takes_gradient: ClassVar[bool] = True
+
+    transfer: AbstractTransfer
+    low: Scalar
+    high: Scalar
+
+    def __init__(self, transfer: AbstractTransfer, low: ArrayLike, high: ArrayLike):
+        if not isinstance(transfer, AbstractTransfer) or transfer.takes_gradient:
+            raise TypeError(f"GradientOpacity scales a transfer function of the scalar, not a {type(transfer).__name__}")
+        self.transfer = transfer
+        self.low, self.high = float_array(low, "low", ()), float_array(high, "high", ())
+        require(jnp.stack([self.low, self.high]), lambda v: (v[0] >= 0) & (v[0] < v[1]), "GradientOpacity needs 0 <= low < high")
+
+    def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
+        assert magnitude is not None
+        # Clipped before the division: far outside of a narrow range the quotient would overflow.
+        share = (jnp.clip(magnitude, self.low, self.high) - self.low) / (self.high - self.low)
+        rgb, sigma_t = self.transfer.evaluate(s)
+        scaled: Channels = tuple(sigma * share for sigma in sigma_t)
+        return Classified(rgb, scaled)
+
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
+        return self.transfer.is_visible(low, high, least)
+
+
+def _cell(x: Scalar, domain: Float[Array, "2"], n: int) -> tuple[Array, Scalar]:
+    """The interval of `n - 1` that a value falls into, and where in it."""
+    at = jnp.clip((x - domain[0]) * ((n - 1) / (domain[1] - domain[0])), 0, n - 1)
+    low = jnp.clip(jnp.floor(at), 0, n - 2)
+    return low.astype(jnp.int32), at - low

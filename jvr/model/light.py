@@ -1,0 +1,237 @@
+"""Lights: from where, and how much of it, light arrives at a point when nothing is in its way.
+
+`direction` is the way that light travels, in the world; `irradiance` is power per unit area perpendicular to it. Colours are linear RGB, a
+single number is grey. Everything is differentiable.
+"""
+
+import abc
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jvr.model.checks import float_array, require
+from jvr.numerics import direction_and_length, dot
+from jvr.types import ArrayLike, Scalar, Triple, Vector
+
+
+class Arrival(NamedTuple):
+    """Light at a point: unit direction towards the light, distance to it (infinite for directional light), irradiance."""
+
+    towards: Triple
+    distance: Scalar
+    irradiance: Triple
+
+
+class AbstractLight(eqx.Module):
+    """A light that comes from one direction at each point."""
+
+    # Whether what is between the light and a point can shade it.
+    casts_shadows: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def arrives(self, x: Triple, w_o: Triple) -> Arrival:
+        """Light at world position `x`, which is looked at from the unit direction `w_o` (to the eye)."""
+
+
+class DirectionalLight(AbstractLight):
+    """Parallel light, as from the sun.
+
+    **Arguments:** `direction`: `(3,)`, the way the light travels, of any length but zero; `irradiance`: a number or `(3,)`, not negative.
+    """
+
+    direction: Vector
+    irradiance: Float[Array, "..."]
+
+    def __init__(self, direction: ArrayLike, irradiance: ArrayLike = 1.0):
+        self.direction = _direction(direction, "DirectionalLight")
+        self.irradiance = _colour(irradiance, "irradiance")
+
+    def arrives(self, x: Triple, w_o: Triple) -> Arrival:
+        travels, _ = direction_and_length(_three(self.direction))
+        return Arrival(tuple(-d for d in travels), jnp.full_like(x[0], jnp.inf), _rgb(self.irradiance))
+
+
+class PointLight(AbstractLight):
+    """A point that shines in all directions. Irradiance at distance `r` is `intensity / max(r, radius)^2`, or with
+    `attenuation = (c, l, q)` `intensity / (c + l r + q r^2)`.
+
+    **Arguments:** `position`: `(3,)`, world; `intensity`: power per solid angle, a number or `(3,)`, not negative; `radius`: distance
+    below which the light grows no brighter, positive: at the light itself irradiance is not defined. `attenuation`: not negative, `c > 0`.
+    """
+
+    position: Vector
+    intensity: Float[Array, "..."]
+    radius: Scalar
+    attenuation: Vector | None
+
+    def __init__(
+        self,
+        position: ArrayLike,
+        intensity: ArrayLike = 1.0,
+        *,
+        radius: ArrayLike = 1e-3,
+        attenuation: ArrayLike | None = None,
+    ):
+        self.position = float_array(position, "position", (3,))
+        require(self.position, np.isfinite, "a light's position must be finite")
+        self.intensity = _colour(intensity, "intensity")
+        self.radius = float_array(radius, "radius", ())
+        require(self.radius, lambda r: np.isfinite(r) & (r > 0), "a light's radius must be positive: 1e-3 is a good start")
+        self.attenuation = None if attenuation is None else _attenuation(attenuation)
+
+    def arrives(self, x: Triple, w_o: Triple) -> Arrival:
+        towards, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
+        falloff = _falloff(distance, self.radius, self.attenuation)
+        return Arrival(towards, distance, tuple(i * falloff for i in _rgb(self.intensity)))
+
+
+class SpotLight(AbstractLight):
+    """A point that shines into a cone: full intensity up to the half-angle `inner` from its axis, none beyond `outer`, smooth in between
+    (a cubic in the cosine).
+
+    **Arguments:** as `PointLight`, and `direction`: `(3,)`, the axis, the way the light travels; `inner`, `outer`: degrees,
+    `0 <= inner < outer <= 180`.
+    """
+
+    position: Vector
+    direction: Vector
+    intensity: Float[Array, "..."]
+    inner: Scalar
+    outer: Scalar
+    radius: Scalar
+    attenuation: Vector | None
+
+    def __init__(
+        self,
+        position: ArrayLike,
+        direction: ArrayLike,
+        intensity: ArrayLike = 1.0,
+        *,
+        inner: ArrayLike = 20.0,
+        outer: ArrayLike = 30.0,
+        radius: ArrayLike = 1e-3,
+        attenuation: ArrayLike | None = None,
+    ):
+        point = PointLight(position, intensity, radius=radius, attenuation=attenuation)
+        self.position, self.intensity = point.position, point.intensity
+        self.radius, self.attenuation = point.radius, point.attenuation
+        self.direction = _direction(direction, "SpotLight")
+        self.inner, self.outer = float_array(inner, "inner", ()), float_array(outer, "outer", ())
+        angles = jnp.stack([self.inner, self.outer])
+        require(
+            angles, lambda a: (a[0] >= 0) & (a[0] < a[1]) & (a[1] <= 180), "a SpotLight needs 0 <= inner < outer <= 180 degrees"
+        )
+
+    def arrives(self, x: Triple, w_o: Triple) -> Arrival:
+        towards, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
+        axis, _ = direction_and_length(_three(self.direction))
+        edge, full = jnp.cos(jnp.deg2rad(self.outer)), jnp.cos(jnp.deg2rad(self.inner))
+        share = jnp.clip((-dot(axis, towards) - edge) / (full - edge), 0.0, 1.0)
+        falloff = share * share * (3 - 2 * share) * _falloff(distance, self.radius, self.attenuation)
+        return Arrival(towards, distance, tuple(i * falloff for i in _rgb(self.intensity)))
+
+
+class HeadLight(AbstractLight):
+    """Light that comes from the eye along each ray; it casts no shadows. `irradiance`: a number or `(3,)`, not negative."""
+
+    casts_shadows: ClassVar[bool] = False
+
+    irradiance: Float[Array, "..."]
+
+    def __init__(self, irradiance: ArrayLike = 1.0):
+        self.irradiance = _colour(irradiance, "irradiance")
+
+    def arrives(self, x: Triple, w_o: Triple) -> Arrival:
+        return Arrival(w_o, jnp.full_like(x[0], jnp.inf), _rgb(self.irradiance))
+
+
+class AmbientLight(eqx.Module):
+    """The same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
+
+    radiance: Float[Array, "..."]
+
+    def __init__(self, radiance: ArrayLike = 1.0):
+        self.radiance = _colour(radiance, "radiance")
+
+    @property
+    def rgb(self) -> Triple:
+        return _rgb(self.radiance)
+
+
+def sphere_light(
+    position: ArrayLike, radius: float, intensity: ArrayLike, *, key: Array, samples: int = 16
+) -> tuple[PointLight, ...]:
+    """A luminous ball as point lights at uniformly random places on its surface, for soft shadows: `Scene(lights=sphere_light(...))`.
+
+    The places are the same for every pixel, so that their error shows as overlapping shadows rather than as noise, and falls as one over
+    the square root of `samples`. Differentiable in `position` and `intensity`.
+    """
+    offsets = jax.random.normal(key, (samples, 3))
+    offsets = offsets / jnp.linalg.norm(offsets, axis=1, keepdims=True)
+    return _spread(position, radius, intensity, offsets)
+
+
+def disc_light(
+    position: ArrayLike, direction: ArrayLike, radius: float, intensity: ArrayLike, *, key: Array, samples: int = 16
+) -> tuple[PointLight, ...]:
+    """As `sphere_light`, with places on a disc across `direction`. It shines to both sides."""
+    angle, square = jax.random.uniform(key, (2, samples), minval=0.0, maxval=jnp.asarray([[2 * np.pi], [1.0]]))
+    axis, _ = direction_and_length(_three(_direction(direction, "disc_light")))
+    u, v = (jnp.stack(side) for side in perpendicular(axis))
+    offsets = jnp.sqrt(square)[:, None] * (jnp.cos(angle)[:, None] * u + jnp.sin(angle)[:, None] * v)
+    return _spread(position, radius, intensity, offsets)
+
+
+def _spread(position: ArrayLike, radius: float, intensity: ArrayLike, offsets: Float[Array, "n 3"]) -> tuple[PointLight, ...]:
+    if not radius > 0:
+        raise ValueError(f"a light's radius must be positive, not {radius!r}; a PointLight has none")
+    center, n = float_array(position, "position", (3,)), offsets.shape[0]
+    return tuple(PointLight(center + radius * offset, _colour(intensity, "intensity") / n) for offset in offsets)
+
+
+def perpendicular(axis: Triple) -> tuple[Triple, Triple]:
+    """Two unit vectors that make an orthonormal basis with a unit vector (Duff et al. 2017, JCGT 6:1)."""
+    x, y, z = axis
+    sign = jnp.where(z >= 0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+def _falloff(distance: Scalar, radius: Scalar, attenuation: Vector | None) -> Scalar:
+    if attenuation is None:
+        return 1.0 / jnp.square(jnp.maximum(distance, radius))
+    constant, linear, quadratic = attenuation
+    return 1.0 / (constant + distance * (linear + distance * quadratic))
+
+
+def _attenuation(value: ArrayLike) -> Vector:
+    attenuation = float_array(value, "attenuation", (3,))
+    valid = lambda a: (a[0] > 0) & np.all(np.isfinite(a) & (a >= 0))
+    require(attenuation, valid, "attenuation is (constant, linear, quadratic), none negative and the constant positive")
+    return attenuation
+
+
+def _direction(value: ArrayLike, name: str) -> Vector:
+    direction = float_array(value, "direction", (3,))
+    valid = lambda d: np.all(np.isfinite(d)) & np.any(d != 0)
+    require(direction, valid, f"{name} has no direction: give the way that the light travels, not (0, 0, 0)")
+    return direction
+
+
+def _colour(value: ArrayLike, name: str) -> Float[Array, "..."]:
+    colour = float_array(value, name, (), (3,))
+    require(colour, lambda c: np.isfinite(c) & (c >= 0), f"a light's {name} must be finite and not negative")
+    return colour
+
+
+def _rgb(colour: Float[Array, "..."]) -> Triple:
+    return (colour, colour, colour) if colour.ndim == 0 else _three(colour)
+
+
+def _three(v: Float[Array, "3"]) -> Triple:
+    return v[0], v[1], v[2]

@@ -1,0 +1,192 @@
+"""Gradients of a volume, from which surfaces get their normals (course notes on GPU-based volume ray-casting, Eurographics 2009,
+section 3.3; Hossain, Alim and Moeller, "Toward high-quality gradient estimation on regular lattices", 2011, compare more of them).
+
+Gradients are estimated along the grid's axes; `Volume.axes_inverse` takes them to the world, so that anisotropic spacing and oblique
+axes are honoured. Towards the border of the domain differences become one-sided; along an axis of one voxel there is none.
+"""
+
+import abc
+import itertools
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jvr.model.transfer import AbstractTransfer
+from jvr.model.volume import Volume, gradients_at_voxels
+from jvr.numerics import add_runs, divide_or_zero, read_run
+from jvr.types import Channels, Scalar, Triple
+
+# The scalar, its derivatives along the grid's axes, and scalars around the point: empty where they are not needed.
+Resampled = tuple[Scalar, Triple, Channels]
+
+
+class AbstractNormals(eqx.Module):
+    """How a gradient is estimated. With `of_opacity` it is that of the extinction, after the transfer function (mean of its channels),
+    else that of the scalar."""
+
+    of_opacity: bool = eqx.field(static=True, default=False)
+
+    @abc.abstractmethod
+    def resample(self, volume: Volume, p: Triple) -> Resampled:
+        """What `gradient` needs, at one grid position."""
+
+    @abc.abstractmethod
+    def deposit(self, volume: Volume, total: tuple[Volume, Any], p: Triple, cotangent: Resampled) -> tuple[Volume, Any]:
+        """Adds the derivative of `sum(cotangent * resample)` over a batch of positions to the gradients of volume and `self`."""
+
+    @abc.abstractmethod
+    def gradient(self, transfer: AbstractTransfer, shape: tuple[int, int, int], p: Triple, resampled: Resampled) -> Triple:
+        """Derivatives along the grid's axes at one position."""
+
+    def prepared(self, volume: Volume, transfer: AbstractTransfer) -> "AbstractNormals":
+        """The same with what can be computed before rays are marched; differentiable."""
+        return self
+
+
+class AnalyticGradient(AbstractNormals):
+    """The gradient of the interpolant itself: exact, nothing else is read, but not continuous from one cell of a trilinear interpolant to
+    the next (the field between cells has kinks). The default."""
+
+    def resample(self, volume: Volume, p: Triple) -> Resampled:
+        s, gradient = jax.value_and_grad(volume.sample)(p)
+        return s, gradient, ()
+
+    def deposit(self, volume: Volume, total: tuple[Volume, Any], p: Triple, cotangent: Resampled) -> tuple[Volume, Any]:
+        of_value, of_gradient, _ = cotangent
+        return volume.deposit(total[0], p, of_value, of_gradient), total[1]
+
+    def gradient(self, transfer: AbstractTransfer, shape: tuple[int, int, int], p: Triple, resampled: Resampled) -> Triple:
+        s, gradient, _ = resampled
+        if not self.of_opacity:
+            return gradient
+        slope = jax.grad(lambda s: extinction(transfer, s))(s)
+        return tuple(slope * g for g in gradient)
+
+
+class AbstractDifferences(AbstractNormals):
+    """A gradient from scalars one voxel away."""
+
+    offsets: ClassVar[tuple[tuple[int, int, int], ...]]
+
+    @abc.abstractmethod
+    def difference(self, shape: tuple[int, int, int], p: Triple, center: Scalar, around: Channels) -> Triple:
+        """The gradient from values at `p` and at the neighbours."""
+
+    def neighbour(self, shape: tuple[int, int, int], p: Triple, offset: tuple[int, int, int]) -> Triple:
+        """Where the scalar is read for an offset: inside of the domain."""
+        return tuple(jnp.clip(x + o, 0, max(n - 1, 0)) if n > 1 else x for x, o, n in zip(p, offset, shape, strict=True))
+
+    def resample(self, volume: Volume, p: Triple) -> Resampled:
+        s = volume.sample(p)
+        around = tuple(volume.sample(self.neighbour(volume.shape, p, o)) for o in self.offsets)
+        return (s, (), around) if self.of_opacity else (s, self.difference(volume.shape, p, s, around), ())
+
+    def deposit(self, volume: Volume, total: tuple[Volume, Any], p: Triple, cotangent: Resampled) -> tuple[Volume, Any]:
+        of_value, of_gradient, of_around = cotangent
+        if not self.of_opacity:
+            zeros = (jnp.zeros_like(of_value), (jnp.zeros_like(of_value),) * len(self.offsets))
+            _, pull = jax.vjp(lambda s, around: self.difference(volume.shape, p, s, around), *zeros)
+            of_center, of_around = pull(of_gradient)
+            of_value += of_center
+        sum_ = volume.deposit(total[0], p, of_value)
+        for offset, of_one in zip(self.offsets, of_around, strict=True):
+            sum_ = volume.deposit(sum_, self.neighbour(volume.shape, p, offset), of_one)
+        return sum_, total[1]
+
+    def gradient(self, transfer: AbstractTransfer, shape: tuple[int, int, int], p: Triple, resampled: Resampled) -> Triple:
+        s, gradient, around = resampled
+        if not self.of_opacity:
+            return gradient
+        return self.difference(shape, p, extinction(transfer, s), tuple(extinction(transfer, x) for x in around))
+
+
+def _span(shape: tuple[int, int, int], p: Triple, axis: int, before: int, after: int) -> Scalar:
+    """Distance between the neighbours `before` and `after` on an axis, as far as they are inside of the domain."""
+    last = shape[axis] - 1
+    return jnp.clip(p[axis] + after, 0, last) - jnp.clip(p[axis] + before, 0, last)
+
+
+class ForwardDifferences(AbstractDifferences):
+    """`s(p + e) - s(p)` along each axis, backwards where the neighbour would be outside: three more scalars, first order."""
+
+    offsets: ClassVar = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+
+    def neighbour(self, shape: tuple[int, int, int], p: Triple, offset: tuple[int, int, int]) -> Triple:
+        inwards = [jnp.where(x + o > n - 1, -o, o) if n > 1 else 0 for x, o, n in zip(p, offset, shape, strict=True)]
+        return tuple(x + o for x, o in zip(p, inwards, strict=True))
+
+    def difference(self, shape: tuple[int, int, int], p: Triple, center: Scalar, around: Channels) -> Triple:
+        signs = [jnp.where(x + 1 > n - 1, -1.0, 1.0) if n > 1 else 0.0 for x, n in zip(p, shape, strict=True)]
+        return tuple(sign * (value - center) for sign, value in zip(signs, around, strict=True))
+
+
+class CentralDifferences(AbstractDifferences):
+    """`(s(p + e) - s(p - e)) / 2` along each axis: six more scalars, second order."""
+
+    offsets: ClassVar = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
+
+    def difference(self, shape: tuple[int, int, int], p: Triple, center: Scalar, around: Channels) -> Triple:
+        return tuple(divide_or_zero(around[2 * a + 1] - around[2 * a], _span(shape, p, a, -1, 1)) for a in range(3))
+
+
+class SobelDifferences(AbstractDifferences):
+    """Central differences smoothed with weights 1, 2, 1 along both other axes (Zucker and Hummel 1981): 26 more scalars, least noise."""
+
+    offsets: ClassVar = tuple((i, j, k) for i, j, k in itertools.product((-1, 0, 1), repeat=3) if (i, j, k) != (0, 0, 0))
+
+    def difference(self, shape: tuple[int, int, int], p: Triple, center: Scalar, around: Channels) -> Triple:
+        def along(axis: int) -> Scalar:
+            total = jnp.zeros_like(center)
+            for offset, value in zip(self.offsets, around, strict=True):
+                smooth = [2 - abs(o) for a, o in enumerate(offset) if a != axis]
+                total += offset[axis] * smooth[0] * smooth[1] / 16 * value
+            return divide_or_zero(total, _span(shape, p, axis, -1, 1))
+
+        return tuple(along(axis) for axis in range(3))
+
+
+class PrecomputedGradient(AbstractNormals):
+    """Central differences at every voxel, computed once and interpolated like the voxels: smooth, for 12 bytes a voxel.
+
+    They are computed anew in each picture unless the volume keeps them (`Volume.graded()`, not with `of_opacity`).
+    """
+
+    gradients: Float[Array, "x y z 3"] | None = None
+
+    def prepared(self, volume: Volume, transfer: AbstractTransfer) -> "PrecomputedGradient":
+        if volume.gradients is not None and not self.of_opacity:
+            return PrecomputedGradient(self.of_opacity, volume.gradients)
+        values = volume.values.astype(volume.slope.dtype) * volume.slope + volume.intercept
+        if self.of_opacity:
+            values = jax.vmap(lambda s: extinction(transfer, s))(values.reshape(-1)).reshape(values.shape)
+        return PrecomputedGradient(self.of_opacity, gradients_at_voxels(values))
+
+    def resample(self, volume: Volume, p: Triple) -> Resampled:
+        assert self.gradients is not None
+        rows, total = self.gradients.reshape(-1, 3), jnp.zeros(3, self.gradients.dtype)
+        for start, weights in volume.interpolation.stencil(volume.shape, p):
+            run = read_run(rows, start, len(weights))
+            total += sum(w * run[i] for i, w in enumerate(weights))
+        return volume.sample(p), (total[0], total[1], total[2]), ()
+
+    def deposit(self, volume: Volume, total: tuple[Volume, Any], p: Triple, cotangent: Resampled) -> tuple[Volume, Any]:
+        of_value, of_gradient, _ = cotangent
+        own = total[1]
+        if own.gradients is not None:
+            rows = own.gradients.reshape(-1, 3)
+            for starts, weights in jax.vmap(lambda p: volume.interpolation.stencil(volume.shape, p))(p):
+                rows = add_runs(rows, starts, jnp.stack(weights, 1)[..., None] * jnp.stack(of_gradient, -1)[:, None])
+            own = PrecomputedGradient(self.of_opacity, rows.reshape(own.gradients.shape))
+        return volume.deposit(total[0], p, of_value), own
+
+    def gradient(self, transfer: AbstractTransfer, shape: tuple[int, int, int], p: Triple, resampled: Resampled) -> Triple:
+        return resampled[1]
+
+
+def extinction(transfer: AbstractTransfer, s: Scalar) -> Scalar:
+    """Extinction at a scalar, the mean of its channels."""
+    sigma_t = transfer.evaluate(s).sigma_t
+    return sum(sigma_t[1:], sigma_t[0]) / len(sigma_t)
