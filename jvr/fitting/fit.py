@@ -23,6 +23,7 @@ from jvr.fitting.work import Work, fingerprint
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import render
+from jvr.rendering.plan import needs_gradient
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
 
@@ -237,7 +238,8 @@ def _check(problem: Problem, solver: AbstractSolver) -> None:
 def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool | int) -> tuple[Problem, Observations]:
     """Samples along the rays, where the volume and its clipping are known and memory allows."""
     moving = any(name.startswith(("scene.volume", "scene.clipping")) for name in problem.unknowns.names)
-    if keep is False or moving or isinstance(problem.loss, DSSIM):
+    # What is kept is the scalar alone.
+    if keep is False or moving or needs_gradient(problem.model.scene) or isinstance(problem.loss, DSSIM):
         return problem, observations
     limit = KEEP_LIMIT if keep is True else keep
     kept = keep_samples(problem.model.scene, observations, problem.settings, chunk, limit)

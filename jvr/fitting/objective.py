@@ -19,8 +19,10 @@ from jvr.march.differentiation import AbstractAdjoint, Forward, Replay
 from jvr.march.march import Marched, MarchOptions
 from jvr.march.rows import TableRows, table_rows
 from jvr.model.camera import AbstractCamera
+from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
 from jvr.rendering.image import composite, step_length, trace
+from jvr.rendering.plan import needs_gradient
 from jvr.rendering.settings import Settings
 from jvr.types import Scalar, Triple
 
@@ -217,7 +219,7 @@ def _kinds(problem: Problem) -> tuple[dict[str, np.ndarray], dict[str, np.ndarra
     for name, array in zip(problem.unknowns.names, problem.unknowns.values(problem.model), strict=True):
         columns = np.arange(begin, begin + array.size).reshape(array.shape)
         begin += array.size
-        is_table = isinstance(problem.model.scene.transfer, AbstractTable)
+        is_table = has_rows(problem.model.scene)
         if is_table and name in ("scene.transfer.rgb", "scene.transfer.sigma_t"):
             entries[name] = columns
         elif name in ("scene.background", "exposure"):
@@ -225,6 +227,12 @@ def _kinds(problem: Problem) -> tuple[dict[str, np.ndarray], dict[str, np.ndarra
         else:
             inner[name] = columns.ravel()
     return entries, outer, inner
+
+
+def has_rows(scene: Scene) -> bool:
+    """Whether entries of the transfer function act through what a sample is classified as, and nothing else."""
+    by_gradient = needs_gradient(scene) and scene.normals.of_opacity
+    return isinstance(scene.transfer, AbstractTable) and scene.shadows is None and not by_gradient
 
 
 def _add_entries(

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model.scene import Scene
+from jvr.numerics import normalise
 from jvr.types import Scalar
 
 # How near to the end of its range a start value may lie: at the end itself a transform has no slope and the fit cannot leave.
@@ -87,6 +88,21 @@ class Sigmoid(AbstractTransform):
         return REACH
 
 
+class Direction(AbstractTransform):
+    """Unit vectors: what has no length to be found."""
+
+    def forward(self, real: Float[Array, "3"]) -> Float[Array, "3"]:
+        return normalise(real)
+
+    def inverse(self, value: Float[Array, "3"]) -> Float[Array, "3"]:
+        return normalise(value)
+
+    @property
+    def reach(self) -> float:
+        # About 30 degrees.
+        return 0.5
+
+
 class Ordered(AbstractTransform):
     """Strictly increasing values with both ends free: the first as it is, then softplus of every gap over the mean gap."""
 
@@ -161,8 +177,9 @@ def choose_unknowns(model: Exposed, select: Callable[[Exposed], Any], transforms
 
     `select` is called on abstract arrays: it may look at structure and shapes, not at values.
 
-    Without `transforms` (a tuple, one for each array, `None` where the default is wanted), colours get `Sigmoid()`, extinction, heights
-    and widths `Softplus`, positions `Ordered`, anything else `Identity`.
+    Without `transforms` (a tuple, one for each array, `None` where the default is wanted), colours, albedo and weights get `Sigmoid()`,
+    asymmetries `Sigmoid(-1, 1)`, extinction, heights, widths and what lights and surfaces have of strength `Softplus`, positions of
+    a table `Ordered`, directions `Direction`, anything else `Identity`.
 
     **Raises** `ValueError` where an array is not one of the scene's, not floating point or named twice, or the number of transforms
     differs.
@@ -219,8 +236,16 @@ def _default_transform(name: str, value: Array, model: Exposed) -> AbstractTrans
         return Sigmoid()
     if field in ("sigma_t", "height"):
         return Softplus(1.0 / jnp.min(model.scene.volume.spacing))
-    if field == "exposure":
+    if field in ("exposure", "ambient", "diffuse", "specular", "threshold"):
         return Softplus()
+    if field in ("irradiance", "intensity", "radiance", "shininess"):
+        return Softplus(jnp.maximum(jnp.mean(value), 1e-3))
+    if field in ("g", "g1", "g2", "k"):
+        return Sigmoid(-1.0, 1.0)
+    if field in ("albedo", "weight"):
+        return Sigmoid()
+    if field == "direction":
+        return Direction()
     if field == "width":
         return Softplus(jnp.mean(value))
     if field == "positions":

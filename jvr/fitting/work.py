@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 
 from jvr.fitting.identifiability import Determination, determination
 from jvr.fitting.losses import DSSIM, SquaredError
-from jvr.fitting.objective import Normal, Problem, image_value, normal_equations, prior_expansion, residual, value
+from jvr.fitting.objective import Normal, Problem, has_rows, image_value, normal_equations, prior_expansion, residual, value
 from jvr.fitting.observations import Observations, thin
 from jvr.fitting.solvers import Functions
-from jvr.march.differentiation import Rows
+from jvr.march.differentiation import Forward, Rows
 from jvr.model.camera import AbstractCamera
 from jvr.parallel import in_threads
 from jvr.types import Scalar
@@ -58,10 +58,11 @@ class ResidualFunction(eqx.Module):
 
     def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
         model = self.problem.unknowns.model_from_real(self.problem.model, real)
+        adjoint = Rows() if has_rows(model.scene) else Forward()
 
         def of_piece(piece: Observations) -> Array:
             scale = jnp.sqrt(piece.weight / self.total)
-            return jnp.stack([scale * c for c in residual(self.problem, model, piece, Rows())])
+            return jnp.stack([scale * c for c in residual(self.problem, model, piece, adjoint)])
 
         return jnp.ravel(jax.lax.map(of_piece, self.pieces)), None
 
@@ -107,8 +108,19 @@ class Work:
             # A loss over whole images has no residual variance: the errors are those that its solution has as least squares.
             problem = problem.least_squares()
         normal = self._sum(values, self.levels[-1], problem)
+        matrix = normal.matrix + self._gauge(values, np.diag(normal.matrix))
         measurements = 3 * int(jnp.sum(self.levels[-1].weight > 0))
-        return determination(normal.matrix, float(normal.squares), measurements, float(jnp.finfo(values.dtype).eps))
+        return determination(matrix, float(normal.squares), measurements, float(jnp.finfo(values.dtype).eps))
+
+    def _gauge(self, values: Float[Array, "unknowns"], diagonal: np.ndarray) -> np.ndarray:
+        """What fixes the length of directions: it is 1 by convention, and no image says anything about it."""
+        fixed, begin = np.zeros((values.size,) * 2), 0
+        for name, part in zip(self.problem.unknowns.names, self.problem.unknowns.split(values, self.problem.model), strict=True):
+            if name.endswith(".direction"):
+                columns = slice(begin, begin + 3)
+                fixed[columns, columns] = diagonal[columns].max() * np.outer(part, part)
+            begin += part.size
+        return fixed
 
     def psnr(self, real: np.ndarray, loss: float, normal: Normal | None) -> float:
         """Decibels relative to radiance 1. Where neither the objective nor what a solver knows is the mean squared error, that costs

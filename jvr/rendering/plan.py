@@ -53,13 +53,18 @@ def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool)
 
 def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
     """How gradients come about, where something asks for them."""
-    scatters = scene.scattering is not None and scene.scattering.needs_gradient
-    if scene.shading is None and not scatters and not scene.transfer.takes_gradient:
+    if not needs_gradient(scene):
         return None, None
     if scene.normals.of_opacity and scene.transfer.takes_gradient:
         raise ValueError("a transfer function of the gradient needs that of the scalar: set normals=...(of_opacity=False)")
     normals = scene.normals.prepared(scene.volume, scene.transfer)
     return GradientFrame(scene.normals, scene.volume.axes_inverse, scene.volume.shape), normals
+
+
+def needs_gradient(scene: Scene) -> bool:
+    """Whether anything in a scene asks for gradients."""
+    scatters = scene.scattering is not None and scene.scattering.needs_gradient
+    return scene.shading is not None or scatters or scene.transfer.takes_gradient
 
 
 def arriving_lights(scene: Scene) -> tuple[AbstractLight, ...]:
