@@ -16,6 +16,7 @@ import numpy as np
 
 import jvr
 from benchmarks import scenes, yardsticks
+from benchmarks.light import light
 from benchmarks.timing import median, ratio, seconds
 from jvr.march.march import MarchOptions, march
 from jvr.rendering.image import enter, step_length
@@ -158,4 +159,4 @@ def startup() -> dict[str, Any]:
     return {"import_beyond_jax": statistics.median(imports), "render_cold": cold, "render_warm": warm}
 
 
-CASES = {"forward": forward, "gradient": gradient, "memory": memory, "fitting": fitting, "startup": startup}
+CASES = {"forward": forward, "gradient": gradient, "memory": memory, "light": light, "fitting": fitting, "startup": startup}

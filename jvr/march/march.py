@@ -283,7 +283,8 @@ def lit(
         # Where nothing is left out everything has a derivative, and between the ends of a segment there may be what is at neither.
         everywhere = medium.occupancy is None or len(sampled) > 1
         wanted = inside if everywhere else inside & has_extinction(medium, sample, points)
-        found.append(sample._replace(light=shadows.transmittances(points, wanted, reverse=reverse)))
+        light = shadows.transmittances(points, wanted, reverse=reverse)
+        found.append(sample._replace(light=computed_once(inside, light)))
     return tuple(found)
 
 
