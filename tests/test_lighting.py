@@ -298,7 +298,7 @@ def test_materials_by_scalar(x64):
 
 
 def test_shadow_of_a_cube_on_a_plane(x64):
-    """A thin screen, z < 2, under an opaque cube, x and y in 4 ... 8, z in 6 ... 9; light from above at 45 degrees, along x. Seen from below.
+    """A thin screen, z < 2, under an opaque cube, x and y in 4 ... 8, z in 6 ... 9; light from above at 45 degrees; seen from below.
 
     Voxels are constant cells, so that all of this is sharp: a line of sight is dark where the light's way to its whole part of the screen
     is blocked, and as a slab where none is."""
@@ -397,8 +397,8 @@ def lit_scene(matrix=OBLIQUE, turn=np.eye(4), scale=1.0, shadows=jvr.ShadowRays(
     center = np.asarray(jvr.Volume(voxels(), OBLIQUE).center)
     lights = (
         jvr.DirectionalLight(turn[:3, :3] @ [1.0, 0.5, -0.3], [0.5, 0.7, 0.9]),
-        jvr.PointLight(place(center + [9, -7, 8]), 100 * scale**2),
-        jvr.SpotLight(place(center + [-8, 9, 4]), turn[:3, :3] @ [8.0, -9, -3], 150 * scale**2, inner=5.0, outer=25.0),
+        jvr.PointLight(place(center + np.array([9, -7, 8])), 100 * scale**2),
+        jvr.SpotLight(place(center + np.array([-8, 9, 4])), turn[:3, :3] @ [8.0, -9, -3], 150 * scale**2, inner=5.0, outer=25.0),
         jvr.HeadLight(0.3),
         jvr.AmbientLight(0.2),
     )
