@@ -7,6 +7,7 @@ where the light is inside of it, by Lambert's azimuthal equal-area projection ab
 
 import abc
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,8 +18,8 @@ from jvr.march.march import Medium
 from jvr.march.steps import Point
 from jvr.model.light import AbstractLight, DirectionalLight, perpendicular
 from jvr.model.scene import Scene
-from jvr.model.volume import ClippingBox, Volume
-from jvr.numerics import direction_and_length, dot
+from jvr.model.volume import Volume
+from jvr.numerics import direction_and_length, dot, ray_box
 from jvr.types import Channels, Scalar, Triple, Vector
 
 # A light nearer to the bounding sphere of the volume than this share of its radius shines in all directions.
@@ -68,9 +69,15 @@ class FanSpace(AbstractLightSpace):
     def place(self, x: Triple) -> Triple:
         d, distance = direction_and_length(tuple(c - self.position[i] for i, c in enumerate(x)))
         across, up, along = (dot(d, tuple(row)) for row in self.axes)
-        # sin(theta / 2) / sin(theta) = 1 / (2 cos(theta / 2)), which is smooth about the axis.
-        scale = 1 / (jnp.sqrt(2 * jnp.maximum(1 + along, 1e-6)) * self.reach)
-        return across * scale, up * scale, (distance - self.near) / (self.far - self.near)
+        # sin(theta / 2) / sin(theta) = 1 / (2 cos(theta / 2)), smooth about the axis; behind the light `sin(theta / 2)` itself, whose
+        # direction across the axis is any where there is none.
+        ahead = along > 0
+        scale = 1 / jnp.sqrt(2 * (1 + jnp.where(ahead, along, 1.0)))
+        (a, b, _), sideways = direction_and_length((across, up, jnp.zeros_like(along)))
+        a = jnp.where(sideways > 0, a, 1.0)
+        rho = jnp.sqrt(0.5 * (1 - jnp.where(ahead, 0.0, along)))
+        u, v = (jnp.where(ahead, c * scale, rho * d) / self.reach for c, d in ((across, a), (up, b)))
+        return u, v, (distance - self.near) / (self.far - self.near)
 
     def ray(self, u: Scalar, v: Scalar) -> tuple[Triple, Triple, Scalar]:
         across, up, along = self.axes
@@ -83,14 +90,14 @@ class FanSpace(AbstractLightSpace):
 
 
 def light_space(light: AbstractLight, volume: Volume) -> AbstractLightSpace:
-    """The coordinates of a light around a volume. Differentiable in the light; detached: how far they reach."""
+    """The coordinates of a light around a volume; differentiable in both."""
     if isinstance(light, DirectionalLight):
         along, _ = direction_and_length((light.direction[0], light.direction[1], light.direction[2]))
         axes = jnp.stack([jnp.stack(side) for side in (*perpendicular(along), along)])
         corners = jnp.asarray([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)], axes.dtype)
         extent = jnp.maximum(jnp.asarray(volume.shape, axes.dtype) - 1, 1) / 2
         half = jnp.max(jnp.abs((corners * extent) @ volume.world_from_grid[:3, :3].T @ axes.T), axis=0)
-        return ParallelSpace(volume.center, axes, jax.lax.stop_gradient(half))
+        return ParallelSpace(volume.center, axes, half)
     position = getattr(light, "position", None)
     if position is None:
         raise TypeError(
@@ -99,35 +106,55 @@ def light_space(light: AbstractLight, volume: Volume) -> AbstractLightSpace:
     along, distance = direction_and_length(tuple(volume.center[i] - position[i] for i in range(3)))
     along = tuple(jnp.where(distance > 0, a, b) for a, b in zip(along, (0.0, 0.0, 1.0), strict=True))
     axes = jnp.stack([jnp.stack(side) for side in (*perpendicular(along), along)])
-    radius, distance = jax.lax.stop_gradient((volume.radius, distance))
+    radius = volume.radius
     outside = distance > NEAR * radius
     half_angle = jnp.where(outside, jnp.arcsin(radius / jnp.where(outside, distance, 2 * radius)), math.pi) / 2
     return FanSpace(position, axes, jnp.sin(half_angle), jnp.maximum(distance - radius, 0.0), distance + radius)
 
 
-def extinction_along(
-    space: AbstractLightSpace, scene: Scene, medium: Medium, u: Float[Array, "..."], v: Float[Array, "..."], w: Scalar
-) -> tuple[Channels, Scalar]:
-    """Extinction of the medium at depth `w` of rays, in each of its channels, 0 outside of the volume; and the rays' lengths."""
+class LightRays(NamedTuple):
+    """A batch of a light's rays: start and direction in grid coordinates, length in the world, and the stretch of it inside of the volume
+    (and its clipping box), of no length where there is none."""
+
+    start: Triple
+    direction: Triple
+    length: Float[Array, "rays"]
+    enters: Float[Array, "rays"]
+    leaves: Float[Array, "rays"]
+
+
+def rays_through(space: AbstractLightSpace, scene: Scene, u: Float[Array, "rays"], v: Float[Array, "rays"]) -> LightRays:
+    """The rays `(u, v)` of a light."""
     volume, clipping = scene.volume, scene.clipping
 
-    def one(u: Scalar, v: Scalar) -> tuple[Channels, Scalar]:
-        start, direction, length = space.ray(u, v)
-        x = tuple(s + w * length * d for s, d in zip(start, direction, strict=True))
-        p = volume.grid_from_world(x)
-        lower, upper = volume.domain
-        inside = jnp.all(jnp.stack([(c >= low) & (c <= high) for c, low, high in zip(p, lower, upper, strict=True)]))
+    def one(u: Scalar, v: Scalar) -> LightRays:
+        x, direction, length = space.ray(u, v)
+        p, along = volume.grid_from_world(x), volume.grid_from_world(direction, direction=True)
+        enters, leaves = ray_box(p, along, *volume.domain)
         if clipping is not None:
-            inside &= _inside(clipping, x)
-        # Outside of the domain nothing may be read.
-        p = tuple(jnp.clip(c, low, high) for c, low, high in zip(p, lower, upper, strict=True))
-        point = Point(p, p, jnp.int32(0), jnp.int32(0))
-        sample = medium.shader.prepare(medium.transfer, medium.field.resample(point), point)
-        sigma_t = medium.shader.classify(medium.transfer, sample).sigma_t
-        return tuple(jnp.where(inside, sigma, 0.0) for sigma in sigma_t), length
+            near, far = ray_box(x, direction, tuple(clipping.lower), tuple(clipping.upper))
+            enters, leaves = jnp.maximum(enters, near), jnp.minimum(leaves, far)
+        hit = leaves > enters
+        return LightRays(p, along, length, jnp.where(hit, enters, 0.0), jnp.where(hit, leaves, 0.0))
 
-    flat, length = jax.vmap(one)(u.ravel(), v.ravel())
-    return tuple(sigma.reshape(u.shape) for sigma in flat), length.reshape(u.shape)
+    return jax.vmap(one)(u, v)
+
+
+def depth_between(medium: Medium, volume: Volume, rays: LightRays, begin: Scalar, end: Scalar) -> Channels:
+    """Optical depth of rays between two depths `w`, by one sample in the middle of what of that is inside of the volume: exact where the
+    medium is homogeneous, and continuous where a border moves."""
+
+    def one(ray: LightRays) -> Channels:
+        low, high = (jnp.clip(w * ray.length, ray.enters, ray.leaves) for w in (begin, end))
+        middle = 0.5 * (low + high)
+        p = tuple(s + middle * d for s, d in zip(ray.start, ray.direction, strict=True))
+        # Where nothing is inside, and by a rounding elsewhere, the middle may be outside, where nothing may be read.
+        p = tuple(jnp.clip(c, first, last) for c, first, last in zip(p, *volume.domain, strict=True))
+        point = Point(p, ray.direction, jnp.int32(0), jnp.int32(0))
+        sample = medium.shader.prepare(medium.transfer, medium.field.resample(point), point)
+        return tuple(sigma * (high - low) for sigma in medium.shader.classify(medium.transfer, sample).sigma_t)
+
+    return jax.vmap(one)(rays)
 
 
 def depth_nodes(
@@ -136,27 +163,23 @@ def depth_nodes(
     """Optical depth from the light to `layers + 1` equally distant depths of `texels^2` rays, by the midpoint rule with `samples` samples a
     layer, swept away from the light."""
     axis = jnp.linspace(-1.0, 1.0, texels)
-    u, v = jnp.meshgrid(axis, axis, indexing="ij")
+    u, v = (c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij"))
+    rays = rays_through(space, scene, u, v)
 
     # Checkpointed: the way back computes a layer again rather than keep all of its voxels.
     @jax.checkpoint
     def sweep(tau: Channels, layer: Array) -> tuple[Channels, Channels]:
         for k in range(samples):
-            w = (layer + (k + 0.5) / samples) / layers
-            sigma_t, length = extinction_along(space, scene, medium, u, v, w)
-            tau = tuple(t + sigma * length / (layers * samples) for t, sigma in zip(tau, sigma_t, strict=True))
+            begin, end = ((layer + (k + half) / samples) / layers for half in (0, 1))
+            dtau = depth_between(medium, scene.volume, rays, begin, end)
+            tau = tuple(t + d for t, d in zip(tau, dtau, strict=True))
         return tau, tau
 
-    channels = jax.eval_shape(lambda: extinction_along(space, scene, medium, u, v, axis[0]))[0]
+    channels = jax.eval_shape(lambda: depth_between(medium, scene.volume, rays, axis[0], axis[1]))
     zero = tuple(jnp.zeros(u.shape, c.dtype) for c in channels)
     _, depths = jax.lax.scan(sweep, zero, jnp.arange(layers, dtype=axis.dtype))
     rows = jnp.stack([jnp.concatenate([z[None], d]) for z, d in zip(zero, depths, strict=True)], axis=-1)
-    return jnp.moveaxis(rows, 0, 2)
-
-
-def _inside(clipping: ClippingBox, x: Triple) -> Array:
-    within = [(c >= clipping.lower[i]) & (c <= clipping.upper[i]) for i, c in enumerate(x)]
-    return within[0] & within[1] & within[2]
+    return jnp.moveaxis(rows, 0, 1).reshape(texels, texels, layers + 1, -1)
 
 
 def bilinear(texels: int, u: Scalar, v: Scalar) -> list[tuple[Array, Scalar]]:

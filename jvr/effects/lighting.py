@@ -74,7 +74,7 @@ class LitPreIntegratedShader(LitShader, PreIntegratedShader):
     def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
         emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
-        factor, added = self.light_at(self.prepare(transfer, _mean(front, back), point), point)
+        factor, added = self.light_at(self.prepare(transfer.table, _mean(front, back), point), point)
         # A constant colour of the given optical depth.
         extra, _ = self.optical.segment(Classified(added, dtau), jnp.ones_like(dt))
         return tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False)), dtau

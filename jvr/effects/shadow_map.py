@@ -101,3 +101,7 @@ class MapVisibility(AbstractVisibility):
         x = jax.lax.stop_gradient(transformed(self.world_from_grid, points.p))
         share = lambda depths: jax.vmap(lambda x: depths.lit_share(x, self.softness))(x)
         return tuple(() if depths is None else (share(depths),) for depths in self.maps)
+
+    @property
+    def stats(self) -> None:
+        return None

@@ -56,6 +56,10 @@ class RayVisibility(AbstractVisibility):
     def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
         return tuple(self._one(light, points, wanted, reverse) for light in self.lights)
 
+    @property
+    def stats(self) -> None:
+        return None
+
     def _one(self, light: AbstractLight, points: Point, wanted: Bool[Array, "rays"], reverse: bool) -> Channels:
         if not light.casts_shadows:
             return ()

@@ -111,6 +111,10 @@ class DepthVisibility(AbstractVisibility):
         x = transformed(self.world_from_grid, points.p)
         return tuple(() if grid is None else grid.transmittance(x, wanted) for grid in self.grids)
 
+    @property
+    def stats(self) -> None:
+        return None
+
 
 def depth_visibility(
     scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, texels: int, layers: int, samples: int

@@ -50,6 +50,11 @@ class AbstractVisibility(eqx.Module):
         Differentiable in reverse mode where `reverse` says so, else in forward mode.
         """
 
+    @property
+    @abc.abstractmethod
+    def stats(self) -> Any:
+        """What is to be reported about it, or `None`."""
+
 
 class AbstractShader(eqx.Module):
     """What a segment looks like: everything between the scalar and the eye. Its arrays are small."""

@@ -20,7 +20,7 @@ from jvr.numerics import add_runs, divide_or_zero, read_run
 from jvr.types import Channels, Scalar, Triple
 
 # The scalar, its derivatives along the grid's axes, and scalars around the point: empty where they are not needed.
-Resampled = tuple[Scalar, Triple, Channels]
+Resampled = tuple[Float[Array, "..."], Triple, Channels]
 
 
 class AbstractNormals(eqx.Module):

@@ -22,11 +22,12 @@ from jvr.types import Image, Scalar, Triple
 
 
 class RenderStats(eqx.Module):
-    """What a rendering took: `steps`, segments sampled for each pixel, `(height, width)`, and what `Settings(sampling=...)` left out,
-    `None` where that is nothing."""
+    """What a rendering took: `steps`, segments sampled for each pixel, `(height, width)`; what `Settings(sampling=...)` left out, and what
+    `Scene(shadows=...)` has to report (`jvr.DeepShadowMap`), each `None` where that is nothing."""
 
     steps: Int[Array, "height width"]
     sampling: SliceStats | RefinementStats | None = None
+    shadows: Any = None
 
     @property
     def samples(self) -> Int[Array, ""]:
@@ -73,7 +74,8 @@ def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> 
         part = functools.partial(_compiled_pixels, scene, camera, settings, where)
         rgb, alpha, depth, steps = in_parts(part, camera.height, camera.width, settings.tile)
     shape = (camera.height, camera.width)
-    return Rendering(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape), RenderStats(steps.reshape(shape)))
+    stats = RenderStats(steps.reshape(shape), shadows=where.shadow_stats)
+    return Rendering(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape), stats)
 
 
 class Seen(NamedTuple):
@@ -81,6 +83,10 @@ class Seen(NamedTuple):
 
     occupancy: Occupancy | None = None
     shadows: AbstractVisibility | None = None
+
+    @property
+    def shadow_stats(self) -> Any:
+        return None if self.shadows is None else self.shadows.stats
 
 
 def seen(scene: Scene, settings: Settings) -> Seen:

@@ -85,7 +85,7 @@ def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sam
     alpha = values[..., 3]
     depth = jnp.where(alpha > 0, divide_or_zero(values[..., 4], alpha), 0.0)
     stats = RefinementStats(traced, jnp.sum(picture.traced, dtype=jnp.int32))
-    return Rendering(values[..., :3], alpha, depth, RenderStats(steps, stats))
+    return Rendering(values[..., :3], alpha, depth, RenderStats(steps, stats, where.shadow_stats))
 
 
 def _trace(
