@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jvr.model.by_value import ByValue
 from jvr.model.checks import float_array, require
 from jvr.model.phase import (
     AbstractPhase,
@@ -36,7 +37,7 @@ class Draine(AbstractPhase):
     g: Numbers
     alpha: Numbers
 
-    def __init__(self, g: ArrayLike, alpha: ArrayLike):
+    def __init__(self, g: ArrayLike | ByValue, alpha: ArrayLike):
         self.g, self.alpha = asymmetry(g, "g"), float_array(alpha, "alpha", (), (3,))
         require(self.alpha, lambda a: np.isfinite(a) & (a >= 0), "alpha must be finite and not negative")
 

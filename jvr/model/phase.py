@@ -151,12 +151,12 @@ def sample_henyey_greenstein(g: Numbers, u: Numbers) -> ScatteringAngle:
 class HenyeyGreenstein(AbstractPhase):
     """One lobe of asymmetry `g`, see `henyey_greenstein`; forward for `g > 0`, isotropic for `g = 0`.
 
-    **Arguments:** `g`: `()` or `(3,)`, between -1 and 1 without either; differentiable. **Raises** `ValueError` otherwise.
+    **Arguments:** `g`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either; differentiable. **Raises** `ValueError` otherwise.
     """
 
     g: Numbers
 
-    def __init__(self, g: ArrayLike):
+    def __init__(self, g: ArrayLike | ByValue):
         self.g = asymmetry(g, "g")
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
@@ -181,7 +181,7 @@ class DoubleHenyeyGreenstein(AbstractPhase):
     g2: Numbers
     weight: Numbers
 
-    def __init__(self, g1: ArrayLike, g2: ArrayLike, weight: ArrayLike):
+    def __init__(self, g1: ArrayLike | ByValue, g2: ArrayLike | ByValue, weight: ArrayLike):
         self.g1, self.g2 = asymmetry(g1, "g1"), asymmetry(g2, "g2")
         self.weight = float_array(weight, "weight", (), (3,))
         require(self.weight, lambda w: (w >= 0) & (w <= 1), "weight, of the first lobe, must be in [0, 1]")
@@ -211,13 +211,13 @@ class Schlick(AbstractPhase):
     """`p = (1 - k^2) / (4 pi (1 - k cos theta)^2)` (Blasi, Le Saec and Schlick 1993), which needs no square root.
 
     It resembles Henyey-Greenstein for `k = 1.55 g - 0.55 g^3` (Pharr and Humphreys 2004).
-    **Arguments:** `k`: `()` or `(3,)`, between -1 and 1 without either, forward for `k > 0`; differentiable.
+    **Arguments:** `k`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either, forward for `k > 0`; differentiable.
     **Raises** `ValueError` otherwise.
     """
 
     k: Numbers
 
-    def __init__(self, k: ArrayLike):
+    def __init__(self, k: ArrayLike | ByValue):
         self.k = asymmetry(k, "k")
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
