@@ -111,6 +111,7 @@ def snapshot(folder):
         ("render fit.toml -o kept.png --set shadows=rays", "no light that casts them"),
         ("render fit.toml -o kept.png --set lights=haed", "did you mean 'head'?"),
         ("fit fit.toml -o new --set fit.unknowns=['lights[0].direction']", "fit.unknowns[0]"),
+        ("render fit.toml -o kept.png --set settings.sampling=slices --set shading=lambert", "jvr.Slices() does not know light"),
         ("fit fit.toml", "--output"),
         ("fit fit.toml -o kept.png", "this is a file"),
         ("fit fit.toml -o new --resume", "--resume"),

@@ -107,7 +107,7 @@ def light_space(light: AbstractLight, volume: Volume) -> AbstractLightSpace:
 
 def extinction_along(
     space: AbstractLightSpace, scene: Scene, medium: Medium, u: Float[Array, "..."], v: Float[Array, "..."], w: Scalar
-) -> tuple[Channels, Scalar]:
+) -> tuple[Channels, Float[Array, "..."]]:
     """Extinction of the medium at depth `w` of rays, in each of its channels, 0 outside of the volume; and the rays' lengths."""
     volume, clipping = scene.volume, scene.clipping
 
