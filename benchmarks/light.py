@@ -40,7 +40,7 @@ def lit(scene: jvr.Scene, camera: jvr.PerspectiveCamera) -> jvr.Scene:
     lights = (jvr.DirectionalLight(direction, 1.0), jvr.AmbientLight(0.3))
     shading = jvr.BlinnPhong(ambient=0.8, diffuse=0.8, specular=0.3, shininess=40.0)
     return eqx.tree_at(
-        lambda s: (s.lights, s.shading), scene, (lights, shading), is_leaf=lambda x: x is None or isinstance(x, tuple) and not x
+        lambda s: (s.lights, s.shading), scene, (lights, shading), is_leaf=lambda x: x is None or (isinstance(x, tuple) and not x)
     )
 
 

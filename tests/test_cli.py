@@ -41,6 +41,36 @@ solver = "levenberg-marquardt"
 entries = 6
 domain = [0.0, 1.0]
 """
+LIGHT = """
+[volume]
+builtin = "demo"
+[camera]
+kind = "fibonacci"
+count = 2
+width = 8
+height = 8
+[settings]
+step = 4.0
+[truth]
+kind = "linear"
+positions = [0.2, 0.5]
+rgb = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+sigma_t = [0.0, 0.2]
+gradient_opacity = { low = 0.0, high = 0.01 }
+[[lights]]
+kind = "directional"
+direction = [1, 0.5, -1]
+irradiance = 3.0
+[scattering.phase]
+kind = "henyey-greenstein"
+g = 0.4
+[fit]
+unknowns = ["scattering.phase.g", "lights.0.irradiance"]
+max_steps = 3
+[fit.initial]
+scattering.phase.g = 0.1
+lights.0.irradiance = 2.0
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -77,6 +107,11 @@ def snapshot(folder):
         ("render volume.npy -o kept.png --preset ct_bones", "did you mean 'ct_bone'?"),
         ("render volume.npy -o kept.png --shape 6,7", "--shape"),
         ("render kept.png -o kept.png", "unsupported extension"),
+        ("render fit.toml -o kept.png --set shadows=['rays','map']", "'rays' and 'map' exclude each other"),
+        ("render fit.toml -o kept.png --set shadows=rays", "no light that casts them"),
+        ("render fit.toml -o kept.png --set lights=haed", "did you mean 'head'?"),
+        ("fit fit.toml -o new --set fit.unknowns=['lights[0].direction']", "fit.unknowns[0]"),
+        ("render fit.toml -o kept.png --set settings.sampling=slices --set shading=lambert", "jvr.Slices() does not know light"),
         ("fit fit.toml", "--output"),
         ("fit fit.toml -o kept.png", "this is a file"),
         ("fit fit.toml -o new --resume", "--resume"),
@@ -216,6 +251,18 @@ def _folder_of_a_fit(folder, printed):
     np.testing.assert_allclose(read_image(folder / "difference_00.exr"), difference, atol=1e-6)
     mean = np.mean([np.mean(read_image(folder / f"difference_0{i}.exr") ** 2.0) for i in range(2)])
     assert report["views"]["mean_psnr"] == pytest.approx(-10 * np.log10(mean), abs=1e-3)
+
+
+def test_a_fit_of_light_through_the_command_line(tmp_path, capsys):
+    """With a transfer function of the gradient, which is no curve to draw."""
+    (tmp_path / "light.toml").write_text(LIGHT)
+    assert cli.run(["fit", "light.toml", "-o", "out", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert list(report["standard_errors"]) == ["scattering.phase.g", "lights[0].irradiance"]
+    assert report["history"][-1]["psnr"] > report["history"][0]["psnr"]
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "scattering.phase.g" in page
+    assert isinstance(read_transfer(tmp_path / "out" / "transfer.toml"), jvr.GradientOpacity)
 
 
 def test_images_in_files_can_be_fitted_and_must_fit_their_cameras(tmp_path, capfd):

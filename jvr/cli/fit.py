@@ -3,13 +3,12 @@
 import json
 import shlex
 import time
-import traceback
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jvr.cli.inputs import BadInput, Interrupted, reading
+from jvr.cli.inputs import BadInput, Interrupted, reading, refused_by_jvr
 from jvr.cli.runtime import nested, plain, progress, provenance, use_compilation_cache
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
 
@@ -52,15 +51,9 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
         kept = f"{checkpoint} is kept, --resume goes on from it" if checkpoint.exists() else "no step was finished"
         raise Interrupted(f"interrupted: {kept}") from error
     except ValueError as error:
-        if not _refused_by_jvr(error):
+        if not refused_by_jvr(error):
             raise
         raise BadInput(f"fit: {error}") from error
-
-
-def _refused_by_jvr(error: ValueError) -> bool:
-    """Whether the error was raised in jvr's own code on purpose, rather than somewhere below it."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return Path(last.filename).is_relative_to(Path(__file__).parents[1]) and (last.line or "").lstrip().startswith("raise")
 
 
 def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float) -> dict[str, Any]:

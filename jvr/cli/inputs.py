@@ -4,6 +4,7 @@ import contextlib
 import os
 import sys
 import tempfile
+import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -33,6 +34,12 @@ def reading() -> Iterator[None]:
             raise BadInput(_system_problem(error)) from error
         except (ValueError, TypeError) as error:
             raise BadInput(str(error)) from error
+
+
+def refused_by_jvr(error: Exception) -> bool:
+    """Whether the error was raised in jvr's own code on purpose, rather than somewhere below it."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return Path(last.filename).is_relative_to(Path(__file__).parents[1]) and (last.line or "").lstrip().startswith("raise")
 
 
 def explain(message: str, status: int) -> int:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jvr.cli.inputs import reading
+from jvr.cli.inputs import BadInput, reading, refused_by_jvr
 from jvr.cli.runtime import plain, progress, provenance, use_compilation_cache
 from jvr.io.config import Config, build_cameras, build_scene, build_settings
 
@@ -32,7 +32,7 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
         for i, camera in enumerate(cameras):
             with compiling() as compiled:
                 start = time.perf_counter()
-                picture = jax.block_until_ready(render(scene, camera, settings))
+                picture = jax.block_until_ready(_rendered(render, scene, camera, settings))
                 seconds = time.perf_counter() - start
             compile_seconds += compiled[0]
             pictures.append(_numbers(picture, camera, outputs[i], seconds - compiled[0]))
@@ -49,6 +49,16 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
         "compile_seconds": compile_seconds,
         **provenance(),
     }
+
+
+def _rendered(render: Any, *arguments: Any) -> Any:
+    """A picture. What renders no scene of this kind says so while it is compiled."""
+    try:
+        return render(*arguments)
+    except (ValueError, TypeError) as error:
+        if not refused_by_jvr(error):
+            raise
+        raise BadInput(f"render: {error}") from error
 
 
 def _names(output: Path, count: int) -> list[Path]:

@@ -19,7 +19,7 @@ from jvr.march.steps import Point
 from jvr.model.light import AbstractLight, DirectionalLight, perpendicular
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.numerics import direction_and_length, dot, ray_box
+from jvr.numerics import computed_once, direction_and_length, dot, ray_box
 from jvr.types import Channels, Scalar, Triple, Vector
 
 # A light nearer to the bounding sphere of the volume than this share of its radius shines in all directions.
@@ -144,17 +144,16 @@ def depth_between(medium: Medium, volume: Volume, rays: LightRays, begin: Scalar
     """Optical depth of rays between two depths `w`, by one sample in the middle of what of that is inside of the volume: exact where the
     medium is homogeneous, and continuous where a border moves."""
 
-    def one(ray: LightRays) -> Channels:
-        low, high = (jnp.clip(w * ray.length, ray.enters, ray.leaves) for w in (begin, end))
-        middle = 0.5 * (low + high)
-        p = tuple(s + middle * d for s, d in zip(ray.start, ray.direction, strict=True))
-        # Where nothing is inside, and by a rounding elsewhere, the middle may be outside, where nothing may be read.
-        p = tuple(jnp.clip(c, first, last) for c, first, last in zip(p, *volume.domain, strict=True))
-        point = Point(p, ray.direction, jnp.int32(0), jnp.int32(0))
-        sample = medium.shader.prepare(medium.transfer, medium.field.resample(point), point)
-        return tuple(sigma * (high - low) for sigma in medium.shader.classify(medium.transfer, sample).sigma_t)
-
-    return jax.vmap(one)(rays)
+    low, high = (jnp.clip(w * rays.length, rays.enters, rays.leaves) for w in (begin, end))
+    middle, inside = 0.5 * (low + high), high > low
+    p = (s + middle * d for s, d in zip(rays.start, rays.direction, strict=True))
+    # Where nothing is inside, and by a rounding elsewhere, the middle may be outside, where nothing may be read.
+    p = tuple(jnp.clip(c, first, last) for c, first, last in zip(p, *volume.domain, strict=True))
+    point = Point(p, rays.direction, *(jnp.zeros_like(middle, jnp.int32),) * 2)
+    samples = computed_once(inside, jax.vmap(medium.field.resample)(point))
+    prepared = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, point)
+    sigma_t = jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, prepared).sigma_t
+    return tuple(jnp.where(inside, sigma * (high - low), 0.0) for sigma in sigma_t)
 
 
 def depth_nodes(

@@ -109,6 +109,19 @@ class Phong(Lambert):
 class BlinnPhong(Phong):
     """As `Phong` with `specular E max(n . h, 0)^shininess`, `h` half-way between the directions to eye and light."""
 
+    # Written out because type checkers take a dataclass's fields for its arguments where it has no constructor of its own.
+    def __init__(
+        self,
+        ambient: ArrayLike | ByValue = 0.1,
+        diffuse: ArrayLike | ByValue = 0.7,
+        specular: ArrayLike | ByValue = 0.3,
+        shininess: ArrayLike | ByValue = 30.0,
+        *,
+        threshold: ArrayLike = 0.0,
+        two_sided: bool = True,
+    ):
+        super().__init__(ambient, diffuse, specular, shininess, threshold=threshold, two_sided=two_sided)
+
     def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         half, length = direction_and_length(tuple(o + i for o, i in zip(w_o, w_i, strict=True)))
         return jnp.where(length > 0, self.specular * power_of_cosine(normal, half, self.shininess), 0.0)

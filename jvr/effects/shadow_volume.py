@@ -1,9 +1,8 @@
-"""Optical depth from the light, swept once through the volume and interpolated: shadow volumes and opacity shadow maps."""
+"""Transmittance from the light, swept once through the volume and interpolated: shadow volumes and opacity shadow maps."""
 
 import math
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -18,13 +17,13 @@ from jvr.types import Affine, Channels, Scalar, Triple
 
 
 class ShadowVolume(AbstractShadows):
-    """A volume of optical depth, swept away from the light (Behrens and Ratering 1998, in the light's own coordinates).
+    """A volume of transmittance, swept away from the light (Behrens and Ratering 1998, in the light's own coordinates).
 
-    **Arguments:** `resolution`: nodes of the shadow volume for each voxel along an axis, above 0. Between nodes optical depth is
-    interpolated trilinearly; along the light's rays extinction is sampled every two voxels or less, whatever the resolution. Shadows of what
-    is smaller than a node are blurred; the error falls with the square of the resolution in smooth scenes.
+    **Arguments:** `resolution`: nodes of the shadow volume for each voxel of the volume's diagonal, above 0. Between nodes
+    transmittance is interpolated trilinearly; along the light's rays extinction is sampled every two voxels or less, whatever the
+    resolution. Shadows of what is smaller than a node are blurred; the error falls with the square of the resolution in smooth scenes.
 
-    For directional and point (spot) lights. Differentiable in transfer function, voxels, lights and pose. Memory: 4 bytes for each node
+    For directional and point (spot) lights. Differentiable in transfer function, voxels, lights and pose. Memory: 32 bytes for each node
     and channel of extinction.
     """
 
@@ -44,12 +43,12 @@ class ShadowVolume(AbstractShadows):
 
 
 class OpacityShadowMap(AbstractShadows):
-    """A map of rays with the optical depth at equally distant layers (Kim and Neumann 2001), linear in between.
+    """A map of rays with the transmittance at equally distant layers (Kim and Neumann 2001), linear in between.
 
     **Arguments:** `texels`: rays along each axis of the map; `layers`: of optical depth along each. Detail across the light is kept by the
-    texels; between two layers the medium counts as homogeneous.
+    texels; between two layers transmittance is a straight line.
 
-    For directional and point (spot) lights. Differentiable as `ShadowVolume`. Memory: `4 texels^2 (layers + 1)` bytes for each channel of
+    For directional and point (spot) lights. Differentiable as `ShadowVolume`. Memory: `32 texels^2 layers` bytes for each channel of
     extinction.
     """
 

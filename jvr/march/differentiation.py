@@ -65,7 +65,9 @@ def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[M
     tangents = eqx.filter(tangents, perturbed)
     medium, rays, dt = primals
     if medium.shadows is not None:
-        raise ValueError("jvr.Rows() does not know shadows: set Settings(adjoint=jvr.Replay()), or jvr.Forward() for forward mode")
+        raise ValueError(
+            "jvr.Rows() does not know shadows: set Settings(adjoint=jvr.Replay()), or jvr.Forward() for forward mode"
+        )
     rest_of_transfer, entries = _split_entries(tangents[0].transfer)
     if options.distance or not jax.tree.leaves(entries):
         primal, tangent = march(options, *primals), None

@@ -1,7 +1,7 @@
 """From checked tables to the objects of `jvr`: the one place where a name becomes an object."""
 
 import difflib
-import itertools
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,26 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jvr.io.config.cameras import cameras_of
 from jvr.io.config.errors import ConfigError, blame
-from jvr.io.config.load import Config
-from jvr.io.config.schema import (
-    AnyCamera,
-    AnySampling,
-    AnyTransfer,
-    FitTable,
-    OrthographicTable,
-    PerspectiveTable,
-    RefinementTable,
-    RigTable,
-    SlicesTable,
-    TransferFile,
-    VolumeTable,
-)
-from jvr.io.config.transfers import build_transfer, read_transfer
+from jvr.io.config.light import graded, light_parts
+from jvr.io.config.load import Config, started
+from jvr.io.config.schema.transfer import AnyTransfer, TransferFile
+from jvr.io.config.schema.whole import AnySampling, FitTable, RefinementTable, SlicesTable, VolumeTable
+from jvr.io.config.transfers import build_transfer, read_transfer, with_gradient
 from jvr.march.differentiation import Forward, Replay, Rows
 from jvr.march.oracle import BrickRange, Finest, LocalError, OpacityChange
 from jvr.march.quadrature import Midpoint, PreIntegrated
-from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, fibonacci_sphere, look_at, orbit
+from jvr.model.camera import AbstractCamera, PerspectiveCamera, fibonacci_sphere
 from jvr.model.optical import AbsorptionOnly, EmissionAbsorption, EmissionOnly
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTransfer, LutTransfer
@@ -44,10 +35,6 @@ ORACLES = {"local-error": LocalError, "opacity-change": OpacityChange, "brick-ra
 INTERPOLATIONS = {"trilinear": Trilinear, "nearest": Nearest}
 OPTICAL = {"emission-absorption": EmissionAbsorption, "emission-only": EmissionOnly, "absorption-only": AbsorptionOnly}
 READ_KEYWORDS = ("shape", "dtype", "spacing", "origin", "array", "series", "axes", "nan_value")
-# From the front of a patient (-y in LPS), a little from above and from the left.
-AUTOMATIC_DIRECTION = np.array([0.45, -1.0, 0.35])
-# How much larger than the box of the volume a picture is.
-MARGIN = 1.05
 
 
 class FitJob(NamedTuple):
@@ -118,7 +105,7 @@ def build_cameras(config: Config, volume: Volume) -> tuple[AbstractCamera, ...]:
     for i, table in enumerate(config.tables.camera):
         key = f"camera[{i}]" if len(config.tables.camera) > 1 else "camera"
         with blame(config.where(key), key):
-            cameras.extend(_cameras(table, volume))
+            cameras.extend(cameras_of(table, volume))
     return tuple(cameras)
 
 
@@ -132,8 +119,7 @@ def build_fit(config: Config, read_image: Callable[[Path], np.ndarray] | None = 
         raise ConfigError(config.name, "fit", "missing; add a table [fit] that says what to find")
     volume, settings = build_volume(config), build_settings(config)
     cameras = build_cameras(config, volume)
-    transfer = _start(config, volume) if tables.transfer is None else _transfer(config, tables.transfer, volume, "transfer")
-    scene = _scene(config, volume, transfer)
+    scene = _scene(started(config), volume, _start_transfer(config, fit, volume))
     keywords = {**_keywords(config, fit), "unknowns": _unknowns(config, fit, scene), "settings": settings}
     if tables.truth is None:
         images = _images(config, fit, cameras, read_image)
@@ -177,13 +163,31 @@ def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
     if tables.clipping is not None:
         with blame(config.where("clipping"), "clipping"):
             clipping = ClippingBox(tables.clipping.lower, tables.clipping.upper)
-    return Scene(volume, transfer, background=tables.background, optical=OPTICAL[tables.optical](), clipping=clipping)
+    light = light_parts(config, transfer)
+    fitted = () if tables.fit is None else tables.fit.unknowns
+    if not any(name.startswith("volume.") for name in fitted):
+        volume = graded(volume, light, transfer)
+    surroundings = {"background": tables.background, "clipping": clipping, "optical": OPTICAL[tables.optical]()}
+    return Scene(volume, transfer, **surroundings, **light)
 
 
 def _transfer(config: Config, table: AnyTransfer, volume: Volume, key: str) -> AbstractTransfer:
     if isinstance(table, TransferFile):
-        return read_transfer(config.find(table.path, f"{key}.path"))
+        found = read_transfer(config.find(table.path, f"{key}.path"))
+        with blame(config.where(key), f"{key}.gradient_opacity"):
+            return with_gradient(found, table)
     return build_transfer(table, volume, config.where(key), key)
+
+
+def _start_transfer(config: Config, fit: FitTable, volume: Volume) -> AbstractTransfer:
+    """The given one, the truth where it is not what is fitted, or a flat table."""
+    tables = config.tables
+    if tables.transfer is not None:
+        return _transfer(config, tables.transfer, volume, "transfer")
+    known = not any(name.startswith("transfer.") for name in fit.unknowns)
+    if tables.truth is not None and fit.start is None and known:
+        return _transfer(config, tables.truth, volume, "truth")
+    return _start(config, volume)
 
 
 def _start(config: Config, volume: Volume) -> AbstractTransfer:
@@ -202,61 +206,6 @@ def _start(config: Config, volume: Volume) -> AbstractTransfer:
             flat = flat_transfer(volume, start.entries, opacity=sigma_t * float(jnp.min(volume.spacing)), grey=start.grey)
             return flat
         return LutTransfer(np.full((start.entries, 3), start.grey), np.full(start.entries, sigma_t), start.domain)
-
-
-def _cameras(table: AnyCamera, volume: Volume) -> tuple[AbstractCamera, ...]:
-    """The cameras of one table; what it leaves out comes from the box of the volume."""
-    center = np.asarray(volume.center if table.target is None else table.target, float)
-    if isinstance(table, RigTable):
-        return _rig(table, center, float(volume.radius))
-    right, up, back = _pose(table, center)
-    corners = _corners(volume) - center
-    x, y, depth = np.abs(corners @ right), np.abs(corners @ up), corners @ back
-    aspect = table.width / table.height
-    if isinstance(table, PerspectiveTable):
-        half = np.tan(np.radians(table.fov_y / 2))
-        distance = np.max(np.maximum(x / (half * aspect), y / half) * MARGIN + depth)
-        pose = look_at(center + distance * back if table.eye is None else table.eye, center, up)
-        return (PerspectiveCamera(pose, table.fov_y, table.width, table.height),)
-    extent = 2 * MARGIN * np.max(np.maximum(x / aspect, y)) if table.height_world is None else table.height_world
-    pose = look_at(center + (np.max(depth) + extent) * back if table.eye is None else table.eye, center, up)
-    return (OrthographicCamera(pose, extent, table.width, table.height),)
-
-
-def _corners(volume: Volume) -> np.ndarray:
-    """World positions of the eight corners of the domain, `(8, 3)`."""
-    low, high = volume.domain
-    grid = np.array(list(itertools.product(*zip(low, high, strict=True))))
-    matrix = np.asarray(volume.world_from_grid, float)
-    return grid @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def _pose(table: PerspectiveTable | OrthographicTable, center: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Axes of the camera: right, up and back. z is up unless the view is along it."""
-    back = AUTOMATIC_DIRECTION if table.eye is None else np.asarray(table.eye) - center
-    if np.allclose(back, 0):
-        raise ValueError("eye and target are the same point: move one of them")
-    back = back / np.linalg.norm(back)
-    upward = np.eye(3)[2 if abs(back[2]) < 0.999 else 1] if table.up is None else np.asarray(table.up)
-    right = np.cross(upward, back)
-    if not np.linalg.norm(right) > 1e-6 * np.linalg.norm(upward):
-        raise ValueError("up must not be zero or parallel to the view: choose another")
-    right = right / np.linalg.norm(right)
-    return right, np.cross(back, right), back
-
-
-def _rig(table: RigTable, center: np.ndarray, reach: float) -> tuple[PerspectiveCamera, ...]:
-    if table.half_angle_tangent is not None:
-        fov_y = 2 * np.degrees(np.arctan(table.half_angle_tangent))
-    else:
-        fov_y = 30.0 if table.fov_y is None else table.fov_y
-    aspect = min(1.0, table.width / table.height)
-    half = np.arctan(np.tan(np.radians(fov_y / 2)) * aspect)
-    radius = reach / np.sin(half) if table.radius is None else table.radius
-    if table.kind == "fibonacci":
-        return fibonacci_sphere(center, radius, table.count, fov_y, table.width, table.height)
-    axis = (0.0, 0.0, 1.0) if table.axis is None else table.axis
-    return orbit(center, radius, table.count, fov_y, table.width, table.height, axis=axis)
 
 
 def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:
@@ -307,8 +256,9 @@ def _priors(config: Config, fit: FitTable) -> tuple[Any, ...]:
 def _unknowns(config: Config, fit: FitTable, scene: Scene) -> Callable[[Scene], Any]:
     """Picks the arrays of a scene that `fit.unknowns` names."""
     arrays = {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(scene)}
+    wanted = [re.sub(r"\.(\d+)(?=\.|$)", r"[\1]", name) for name in fit.unknowns]
     fittable = [name for name, leaf in arrays.items() if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    for i, name in enumerate(fit.unknowns):
+    for i, name in enumerate(wanted):
         if name in fittable:
             continue
         near = difflib.get_close_matches(name, fittable, 1, 0.6)
@@ -320,7 +270,7 @@ def _unknowns(config: Config, fit: FitTable, scene: Scene) -> Callable[[Scene], 
     def select(scene: Scene) -> Any:
         found = dict(jax.tree_util.tree_leaves_with_path(scene))
         named = {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in found.items()}
-        return tuple(named[name] for name in fit.unknowns)
+        return tuple(named[name] for name in wanted)
 
     return select
 

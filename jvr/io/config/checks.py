@@ -66,16 +66,33 @@ def increasing(value: list[float]) -> list[float]:
     return value
 
 
-def extinctions(value: Any) -> Any:
-    """One extinction for each entry, or three; pydantic's union would complain about both at once."""
-    if not isinstance(value, list):
-        raise problem(f"must be a list of numbers in brackets (extinction per mm), not {shown(value)}")
-    for i, entry in enumerate(value):
-        if isinstance(entry, list) != isinstance(value[0], list):
-            raise problem("must be one number for each entry, or three for each entry, not a mixture")
-        channels = entry if isinstance(entry, list) else [entry]
-        if isinstance(entry, list) and len(entry) != 3:
-            raise problem(f"entry {i} must be 3 numbers (extinction per mm for red, green, blue), not {shown(entry)}")
-        for channel in channels:
-            _number(channel, "extinction per mm", 0.0, math.inf, False, f"entry {i} ")
-    return value
+def number_or_triple(what: str, low: float = -math.inf, high: float = math.inf, *, inner: bool = False) -> BeforeValidator:
+    """One number, or three for red, green and blue."""
+
+    def check(value: Any) -> float | list[float]:
+        if not isinstance(value, list):
+            return _number(value, what, low, high, inner)
+        if len(value) != 3:
+            raise problem(f"must be one number ({what}) or three for red, green, blue, not {shown(value)}")
+        return [_number(v, what, low, high, inner, f"entry {i} ") for i, v in enumerate(value)]
+
+    return BeforeValidator(check)
+
+
+def numbers_or_triples(what: str, low: float = -math.inf, high: float = math.inf) -> BeforeValidator:
+    """A list with one number for each entry, or three; pydantic's union would complain about both at once."""
+
+    def check(value: Any) -> list[Any]:
+        if not isinstance(value, list):
+            raise problem(f"must be a list of numbers in brackets ({what}), not {shown(value)}")
+        for i, entry in enumerate(value):
+            if isinstance(entry, list) != isinstance(value[0], list):
+                raise problem("must be one number for each entry, or three for each entry, not a mixture")
+            channels = entry if isinstance(entry, list) else [entry]
+            if isinstance(entry, list) and len(entry) != 3:
+                raise problem(f"entry {i} must be 3 numbers ({what} for red, green, blue), not {shown(entry)}")
+            for channel in channels:
+                _number(channel, what, low, high, False, f"entry {i} ")
+        return value
+
+    return BeforeValidator(check)

@@ -17,9 +17,6 @@ SENTENCES = {
     "bool_type": "must be true or false",
     "too_short": "has too few entries",
 }
-# Pydantic puts the name of the alternative that it tried into the place of an error.
-KINDS = ("linear", "lut", "gaussian", "sampled", "preset", "window", "file")
-KINDS += ("perspective", "orthographic", "fibonacci", "orbit", "ramp", "uniform", "slices", "refinement")
 
 
 class ConfigError(ValueError):
@@ -78,12 +75,18 @@ def key_of(loc: Sequence[int | str], data: Any, last: str | None = None) -> str:
                 key, data = f"{key}[{part}]", data[part]
             continue
         found = isinstance(data, dict) and part in data
-        if not found and part in KINDS and not skipped:
+        if not found and not skipped and _is_alternative(part, data):
             skipped = True
             continue
         skipped = False
         key, data = f"{key}.{part}", data[part] if found else None
     return (key + (f".{last}" if last else "")).lstrip(".")
+
+
+def _is_alternative(part: str, data: Any) -> bool:
+    """Whether a part of a place is no key, but the alternative that pydantic tried: a kind of table, or in parentheses."""
+    kind = data.get("kind", "perspective") if isinstance(data, dict) else data
+    return part == kind or part.startswith("(")
 
 
 def shown(value: Any) -> str:

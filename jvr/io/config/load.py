@@ -1,18 +1,21 @@
 """From a TOML file and `--set` to checked tables, and from a name in them to a file."""
 
+import copy
 import dataclasses
 import os
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from jvr.io.config.errors import ConfigError, did_you_mean, first_complaint
-from jvr.io.config.schema import ConfigTable
+from jvr.io.config.schema.whole import ConfigTable
 
 Override = tuple[str, Any]
+# Tables whose values may be others where a fit starts.
+INITIAL = ("lights", "shading", "scattering", "background")
 # Keys of one table that exclude each other.
 ALTERNATIVES = {"path": "builtin", "fov_y": "half_angle_tangent", "opacity": "sigma_t"}
 ALTERNATIVES |= {b: a for a, b in ALTERNATIVES.items()}
@@ -21,7 +24,7 @@ ALTERNATIVES |= {b: a for a, b in ALTERNATIVES.items()}
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Checked tables, and where they come from: `name` is what errors call them, `folder` what their paths are relative to,
-    `text` the file, `overrides` what the command line has set (`overridden` are the keys alone)."""
+    `text` the file, `overrides` what the command line has set (`overridden` are the keys alone), `data` the tables as they were given."""
 
     tables: ConfigTable
     name: str
@@ -29,6 +32,7 @@ class Config:
     overridden: tuple[str, ...] = ()
     text: str = ""
     overrides: tuple[str, ...] = ()
+    data: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def where(self, key: str) -> str:
         """Whose fault a key is: the command line's, or the file's."""
@@ -79,12 +83,38 @@ def config_from(data: dict[str, Any], name: str, folder: Path = Path(), override
         _put(data, key, value)
         keys.append(key)
     try:
-        return Config(ConfigTable.model_validate(data), name, folder, tuple(keys), overrides=tuple(overrides))
+        return Config(ConfigTable.model_validate(data), name, folder, tuple(keys), overrides=tuple(overrides), data=data)
     except ValidationError as error:
         key, problem = first_complaint(error, data)
         # A misspelt table is named by the whole key that was set in it.
         misspelt = problem.startswith("unknown key") and any(k.startswith(f"{key}.") for k in keys)
         raise ConfigError("--set" if misspelt else _where(name, tuple(keys), key), key, problem) from None
+
+
+def started(config: Config) -> Config:
+    """The configuration with the values of `fit.initial` in place of its own.
+
+    **Raises** `ConfigError` for keys that say nothing about light, and for values that are refused there.
+    """
+    fit = config.tables.fit
+    if fit is None or not fit.initial:
+        return config
+    data, place = copy.deepcopy(config.data), config.where("fit.initial")
+    for key, value in _leaves(fit.initial):
+        first = key.split(".")[0]
+        if first not in INITIAL:
+            raise ConfigError(place, f"fit.initial.{key}", f"unknown key; {did_you_mean(first, INITIAL)}")
+        _put(data, key, value, f"{place}: fit.initial")
+    return config_from(data, f"{place}: fit.initial", config.folder)
+
+
+def _leaves(table: dict[str, Any], prefix: str = "") -> Iterator[Override]:
+    for key, value in table.items():
+        path = prefix + key.replace("[", ".").replace("]", "")
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{path}.")
+        else:
+            yield path, value
 
 
 def _where(name: str, overridden: tuple[str, ...], key: str) -> str:
@@ -104,31 +134,31 @@ def _parse(text: str) -> Override:
     return key, parsed["value"] if list(parsed) == ["value"] else value
 
 
-def _put(data: dict[str, Any], key: str, value: Any) -> None:
+def _put(data: dict[str, Any], key: str, value: Any, where: str = "--set") -> None:
     """Sets a dotted key; whole numbers are indices of lists."""
     *parents, last = key.split(".")
     place: Any = data
     for part in parents:
-        place = _enter(place, part, key)
+        place = _enter(place, part, key, where)
     if isinstance(place, list):
-        place[_index(place, last, key)] = value
+        place[_index(place, last, key, where)] = value
     elif isinstance(place, dict):
         # What is set takes the place of its alternative in the file.
         place.pop(ALTERNATIVES.get(last, ""), None)
         place[last] = value
     else:
-        raise ConfigError("--set", key, f"'{'.'.join(parents)}' is a value, not a table")
+        raise ConfigError(where, key, f"'{'.'.join(parents)}' is a value, not a table")
 
 
-def _enter(place: Any, part: str, key: str) -> Any:
+def _enter(place: Any, part: str, key: str, where: str) -> Any:
     if isinstance(place, list):
-        return place[_index(place, part, key)]
+        return place[_index(place, part, key, where)]
     if not isinstance(place, dict):
-        raise ConfigError("--set", key, f"'{part}' lies in a value, not in a table")
+        raise ConfigError(where, key, f"'{part}' lies in a value, not in a table")
     return place.setdefault(part, {})
 
 
-def _index(place: list, part: str, key: str) -> int:
+def _index(place: list, part: str, key: str, where: str) -> int:
     if not part.isdigit() or int(part) >= len(place):
-        raise ConfigError("--set", key, f"'{part}' must be an index from 0 to {len(place) - 1}")
+        raise ConfigError(where, key, f"'{part}' must be an index from 0 to {len(place) - 1}")
     return int(part)

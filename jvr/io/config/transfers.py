@@ -9,19 +9,23 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from jvr.io.config.errors import ConfigError, blame, first_complaint
-from jvr.io.config.schema import (
+from jvr.io.config.schema.transfer import (
     AnyTransfer,
     GaussianPart,
     GaussianTable,
+    GradientTable,
     LinearTable,
     LutTable,
+    OfScalar,
     PresetTable,
     SampledTable,
+    TransferFile,
     TransferTable,
     WindowTable,
 )
 from jvr.io.images import replacing
 from jvr.model import presets
+from jvr.model.gradient_transfer import GradientOpacity, GradientTransfer
 from jvr.model.transfer import AbstractTransfer, GaussianTransfer, LinearTransfer, LutTransfer
 from jvr.model.volume import Volume
 
@@ -30,6 +34,7 @@ FIELDS = {
     LinearTransfer: ("linear", ("positions", "rgb", "sigma_t")),
     LutTransfer: ("lut", ("domain", "rgb", "sigma_t")),
     GaussianTransfer: ("gaussian", ("center", "width", "height", "rgb")),
+    GradientTransfer: ("gradient", ("domain", "magnitudes", "rgb", "sigma_t")),
 }
 # Optical depth of an automatic window's brightest value, from the centre of the volume to its farthest corner.
 AUTOMATIC_DEPTH = 30.0
@@ -40,10 +45,14 @@ def write_transfer(path: str | os.PathLike, transfer: AbstractTransfer) -> None:
 
     **Raises** `TypeError` for a kind of transfer function that has no form in TOML.
     """
+    lines = []
+    if isinstance(transfer, GradientOpacity):
+        bounds = (f"{name} = {_digits(np.asarray(getattr(transfer, name))[()])}" for name in ("low", "high"))
+        lines, transfer = [f"gradient_opacity = {{ {', '.join(bounds)} }}\n"], transfer.transfer
     if type(transfer) not in FIELDS:
         raise TypeError(f"{type(transfer).__name__} cannot be written as TOML")
     kind, names = FIELDS[type(transfer)]
-    lines = [f"{name} = {_toml(np.asarray(getattr(transfer, name)))}\n" for name in names]
+    lines += [f"{name} = {_toml(np.asarray(getattr(transfer, name)))}\n" for name in names]
     with replacing(path) as temporary:
         temporary.write_text("".join([HEADER, f'kind = "{kind}"\n', *lines]), encoding="utf-8")
 
@@ -67,21 +76,36 @@ def read_transfer(path: str | os.PathLike) -> AbstractTransfer:
 
 def build_transfer(table: AnyTransfer, volume: Volume | None, where: str, key: str) -> AbstractTransfer:
     """The transfer function of a table; an automatic window looks at the volume."""
-    with blame(where, key):
-        match table:
-            case LinearTable():
-                return LinearTransfer(table.positions, table.rgb, table.sigma_t)
-            case LutTable():
-                return LutTransfer(table.rgb, table.sigma_t, table.domain)
-            case GaussianTable():
-                return GaussianTransfer(table.center, table.width, table.height, table.rgb)
-            case SampledTable():
-                return _sampled(table)
-            case PresetTable():
-                return getattr(presets, table.preset)()
-            case WindowTable():
-                return _window(table, volume)
+    if isinstance(table, TransferFile):
         raise ConfigError(where, key, "a transfer file cannot name another file")
+    with blame(where, key):
+        if isinstance(table, GradientTable):
+            return GradientTransfer(table.rgb, table.sigma_t, table.domain, table.magnitudes)
+        transfer = _of_scalar(table, volume)
+    with blame(where, f"{key}.gradient_opacity".lstrip(".")):
+        return with_gradient(transfer, table)
+
+
+def with_gradient(transfer: AbstractTransfer, table: OfScalar | TransferFile) -> AbstractTransfer:
+    """The transfer function, scaled by the length of the gradient where its table says so."""
+    scaling = table.gradient_opacity
+    return transfer if scaling is None else GradientOpacity(transfer, scaling.low, scaling.high)
+
+
+def _of_scalar(table: OfScalar, volume: Volume | None) -> AbstractTransfer:
+    match table:
+        case LinearTable():
+            return LinearTransfer(table.positions, table.rgb, table.sigma_t)
+        case LutTable():
+            return LutTransfer(table.rgb, table.sigma_t, table.domain)
+        case GaussianTable():
+            return GaussianTransfer(table.center, table.width, table.height, table.rgb)
+        case SampledTable():
+            return _sampled(table)
+        case PresetTable():
+            return getattr(presets, table.preset)()
+        case WindowTable():
+            return _window(table, volume)
 
 
 def _toml(array: np.ndarray) -> str:

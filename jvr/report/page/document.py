@@ -87,8 +87,9 @@ def write_fit_page(
         f'<p class="lead">{verdict(result, targets, fitted)}</p>',
         summary(result, targets, fitted),
         _pictures(targets, fitted, before),
-        _transfer(transfer, errors, truth, histogram, _reached_by_light(transfer)),
-        transfer_values(transfer, errors),
+        # What depends on the gradient as well is no curve; its fitted numbers are among the other values.
+        *([] if transfer.takes_gradient else [_transfer(transfer, errors, truth, histogram, _reached_by_light(transfer))]),
+        *([] if transfer.takes_gradient else [transfer_values(transfer, errors)]),
         other_values(result.scene, result.errors_by_name),
         determination(result, transfer),
         _convergence(result),

@@ -84,10 +84,10 @@ def _undetermined(transfer: AbstractTransfer, errors: dict[str, np.ndarray]) -> 
 
 
 def other_values(scene: Any, errors: Mapping[str, np.ndarray]) -> str:
-    """What was fitted beside the transfer function: small arrays as numbers, others by size alone."""
+    """What was fitted beside a transfer function of the scalar: small arrays as numbers, others by size alone."""
     rows = []
     for name, error in errors.items():
-        if name.startswith("transfer."):
+        if name.startswith("transfer.") and not scene.transfer.takes_gradient:
             continue
         value = np.asarray(_at(scene, name))
         if value.size <= 16:

@@ -1,52 +1,14 @@
-"""The tables and keys of a configuration. Numbers are checked here, with their units; objects are made in `build`.
-
-Lengths are millimetres where the volume's file says so; a file without a unit defines its own.
-"""
+"""Tables of volume, camera, settings and fit, and the whole of them."""
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from jvr.io.config.checks import extinctions, increasing, number, numbers, problem, whole
-from jvr.io.config.errors import did_you_mean, shown
-
-Scalar = Annotated[float, number("in the data's own units")]
-Length = Annotated[float, number("mm", 0.0, inner=True)]
-Position = Annotated[list[float], numbers(3, "x, y, z in mm")]
-Colour = Annotated[list[float], numbers(3, "red, green, blue, linear")]
-Positions = Annotated[list[float], numbers(None, "in the data's own units"), AfterValidator(increasing)]
-Range = Annotated[list[float], numbers(2, "low, high in the data's own units"), AfterValidator(increasing)]
-Extinctions = Annotated[list[Any], BeforeValidator(extinctions)]
-Extinction = Annotated[float, number("extinction per mm", 0.0)]
-Pixels = Annotated[int, whole("pixels", 1)]
-Angle = Annotated[float, number("full vertical angle in degrees", 0.0, 180.0, inner=True)]
-
-
-class Table(BaseModel):
-    """A table of TOML: no unknown keys, no conversions between types."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _known_keys(cls, data: Any) -> Any:
-        for key in data if isinstance(data, dict) else ():
-            if key not in cls.model_fields:
-                raise problem(f"unknown key; {did_you_mean(key, cls.model_fields)}", key)
-        return data
-
-    def _one_of(self, *names: str) -> None:
-        given = [name for name in names if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise problem(f"excludes {given[0]}: give one of the two", given[1])
-        if not given:
-            raise problem(f"missing; needs {' or '.join(names)}", names[0])
-
-    def _same_length(self, first: str, *others: str) -> None:
-        count = len(getattr(self, first))
-        for other in others:
-            if len(getattr(self, other)) != count:
-                raise problem(f"has {len(getattr(self, other))} entries, {first} has {count}: give as many", other)
+from jvr.io.config.checks import number, numbers, problem, whole
+from jvr.io.config.errors import shown
+from jvr.io.config.schema.light import Lights, Normals, ScatteringTable, Shading, Shadows, casts_shadows
+from jvr.io.config.schema.table import Angle, Colour, Extinction, Length, Pixels, Position, Range, Scalar, Table, named
+from jvr.io.config.schema.transfer import TransferTable
 
 
 class VolumeTable(Table):
@@ -71,119 +33,6 @@ class VolumeTable(Table):
     def _check(self) -> "VolumeTable":
         self._one_of("path", "builtin")
         return self
-
-
-class LinearTable(Table):
-    """`jvr.LinearTransfer`."""
-
-    kind: Literal["linear"]
-    positions: Annotated[Positions, Field(min_length=2)]
-    rgb: list[Colour]
-    sigma_t: Extinctions
-
-    @model_validator(mode="after")
-    def _check(self) -> "LinearTable":
-        self._same_length("positions", "rgb", "sigma_t")
-        return self
-
-
-class LutTable(Table):
-    """`jvr.LutTransfer`."""
-
-    kind: Literal["lut"]
-    domain: Range
-    rgb: Annotated[list[Colour], Field(min_length=2)]
-    sigma_t: Extinctions
-
-    @model_validator(mode="after")
-    def _check(self) -> "LutTable":
-        self._same_length("rgb", "sigma_t")
-        return self
-
-
-class GaussianTable(Table):
-    """`jvr.GaussianTransfer`."""
-
-    kind: Literal["gaussian"]
-    center: Annotated[list[float], numbers(None, "in the data's own units"), Field(min_length=1)]
-    width: Annotated[list[float], numbers(None, "in the data's own units", 0.0, inner=True)]
-    height: Extinctions
-    rgb: list[Colour]
-
-    @model_validator(mode="after")
-    def _check(self) -> "GaussianTable":
-        self._same_length("center", "width", "height", "rgb")
-        return self
-
-
-class GaussianPart(Table):
-    """`height * exp(-(s - center)^2 / (2 width^2))`."""
-
-    kind: Literal["gaussian"]
-    center: Scalar
-    width: Annotated[float, number("in the data's own units", 0.0, inner=True)]
-    height: Extinction
-
-
-class RampPart(Table):
-    """0 up to the first value of `between`, `height` from the second on, linear in between."""
-
-    kind: Literal["ramp"]
-    between: Range
-    height: Extinction
-
-
-Part = Annotated[GaussianPart | RampPart, Field(discriminator="kind")]
-
-
-class SampledTable(Table):
-    """A `jvr.LutTransfer` with extinction summed from parts and colours blended smoothly between a few."""
-
-    kind: Literal["sampled"]
-    entries: Annotated[int, whole("entries of the table", 2)]
-    domain: Range
-    positions: Positions
-    rgb: list[Colour]
-    extinction: list[Part]
-
-    @model_validator(mode="after")
-    def _check(self) -> "SampledTable":
-        self._same_length("positions", "rgb")
-        return self
-
-
-class PresetTable(Table):
-    """One of `jvr.presets`, for CT in Hounsfield units."""
-
-    kind: Literal["preset"]
-    preset: Literal["ct_bone", "ct_soft_tissue", "ct_lung", "ct_vessels"]
-
-
-class WindowTable(Table):
-    """`jvr.presets.window_level`; without window and level they come from the volume's values."""
-
-    kind: Literal["window"]
-    window: Annotated[float, number("width in the data's own units", 0.0, inner=True)] | None = None
-    level: Scalar | None = None
-    sigma_t: Extinction | None = None
-    rgb: Colour = [1.0, 1.0, 1.0]
-
-    @model_validator(mode="after")
-    def _check(self) -> "WindowTable":
-        if (self.window is None) != (self.level is None):
-            raise problem("missing; give window and level, or neither", "window" if self.window is None else "level")
-        return self
-
-
-class TransferFile(Table):
-    """A transfer function in a file of its own, as a fit writes it."""
-
-    kind: Literal["file"]
-    path: str
-
-
-AnyTransfer = LinearTable | LutTable | GaussianTable | SampledTable | PresetTable | WindowTable | TransferFile
-TransferTable = Annotated[AnyTransfer, Field(discriminator="kind")]
 
 
 class ClippingTable(Table):
@@ -271,13 +120,8 @@ class RefinementTable(Table):
     tile: Literal[2, 4, 8, 16, 32, 64] = 8
 
 
-def _sampling(value: Any) -> Any:
-    """A table, or the name of a kind with its defaults."""
-    return {"kind": value} if isinstance(value, str) else value
-
-
 AnySampling = Annotated[UniformTable | SlicesTable | RefinementTable, Field(discriminator="kind")]
-Sampling = Annotated[AnySampling, BeforeValidator(_sampling)]
+Sampling = Annotated[AnySampling, BeforeValidator(named)]
 
 
 class SettingsTable(Table):
@@ -337,9 +181,10 @@ LEAST_SQUARES = ("levenberg-marquardt", "gauss-newton", "dogleg")
 class FitTable(Table):
     """What `jvr.fit` finds, and how. Target images are files, or are rendered with the transfer function of `[truth]`."""
 
-    unknowns: Annotated[list[str], Field(min_length=1)] = ["transfer.rgb", "transfer.sigma_t"]
+    unknowns: Annotated[list[str], Field(min_length=1)] = Field(default=["transfer.rgb", "transfer.sigma_t"])
     images: Annotated[list[str], Field(min_length=1)] | None = None
     start: StartTable | None = None
+    initial: dict[str, Any] = Field(default={})
     solver: Literal["levenberg-marquardt", "gauss-newton", "dogleg", "lbfgsb", "bfgs", "lbfgs", "adam"] = "levenberg-marquardt"
     max_steps: Annotated[int, whole("steps", 1)] = 100
     rtol: Annotated[float, number("relative change at which the fit ends", 0.0, 1.0, inner=True)] | None = None
@@ -367,13 +212,22 @@ class ConfigTable(Table):
     background: Colour | None = None
     optical: Literal["emission-absorption", "emission-only", "absorption-only"] = "emission-absorption"
     clipping: ClippingTable | None = None
-    camera: Cameras = [PerspectiveTable(kind="perspective")]
+    lights: Lights = Field(default=[])
+    shading: Shading | None = None
+    shadows: Shadows | None = None
+    scattering: ScatteringTable | None = None
+    normals: Normals | None = None
+    camera: Cameras = Field(default=[PerspectiveTable(kind="perspective")])
     settings: SettingsTable = SettingsTable()
     fit: FitTable | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "ConfigTable":
         fit = self.fit
+        if self.shadows is not None and not any(map(casts_shadows, self.lights)):
+            raise problem('there is no light that casts them; add [[lights]] with kind = "directional", or "point"', "shadows")
+        if self.shadows is not None and self.shading is None and self.scattering is None:
+            raise problem("nothing shows them; add [shading] or [scattering]", "shadows")
         if fit is None and self.transfer is None and self.truth is None:
             raise problem('missing; add a table such as [transfer] kind = "window"', "transfer")
         if fit is None:
