@@ -20,7 +20,7 @@ from benchmarks.light import light
 from benchmarks.timing import median, ratio, seconds
 from jvr.march.march import MarchOptions, march
 from jvr.rendering.image import enter, step_length
-from jvr.rendering.plan import medium
+from jvr.rendering.medium import medium
 
 SIZE = 256
 

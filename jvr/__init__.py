@@ -93,6 +93,8 @@ if TYPE_CHECKING:
     from jvr.model.phase import Mixture as Mixture
     from jvr.model.phase import Rayleigh as Rayleigh
     from jvr.model.phase import Schlick as Schlick
+    from jvr.rendering.advise import Advice as Advice
+    from jvr.rendering.advise import advise as advise
     from jvr.rendering.measure import Measurement as Measurement
     from jvr.rendering.measure import measure as measure
     from jvr.rendering.tune import Tuned as Tuned
@@ -126,6 +128,7 @@ _LATE = {
     "jvr.io.volumes": ("read_volume",),
     "jvr.model.mie": ("Draine", "JendersieEon", "TabulatedPhase"),
     "jvr.model.phase": ("DoubleHenyeyGreenstein", "HenyeyGreenstein", "Isotropic", "Mixture", "Rayleigh", "Schlick"),
+    "jvr.rendering.advise": ("Advice", "advise"),
     "jvr.rendering.measure": ("Measurement", "measure"),
     "jvr.rendering.tune": ("Tuned", "tune"),
 }

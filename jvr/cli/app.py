@@ -112,17 +112,35 @@ def tune(
     _print(report, as_json, "\n".join(lines))
 
 
-@app.command(epilog=_examples("jvr plan configs/demo.toml", "jvr plan configs/demo.toml --set settings.termination=0 --json"))
-def plan(given: ConfigFile, sets: Set = None, as_json: Json = False) -> None:
-    """Say what a rendering compiles to: which parts are in the program, and why."""
+@app.command(epilog=_examples("jvr plan configs/lit.toml", "jvr plan configs/lit.toml --measure --tolerance 1/255"))
+def plan(
+    given: ConfigFile,
+    measure: Annotated[
+        bool, typer.Option("--measure", help="Render with and without each effect: its share of time, and what it changes.")
+    ] = False,
+    tolerance: Annotated[
+        str | None,
+        typer.Option(metavar="X", help="Propose what to drop or coarsen within this RMSE, such as 1/255; measures as well."),
+    ] = None,
+    sets: Set = None,
+    as_json: Json = False,
+) -> None:
+    """Say what a rendering compiles to: which parts are in the program, why, and what they need."""
+    from jvr.cli.advise import advise_on, as_tolerance
+
+    bound = None if tolerance is None else as_tolerance(tolerance)
     with reading():
         from jvr.io.config import build_scene, build_settings
         from jvr.rendering.plan import plan as make_plan
 
         config = load(given, sets or [])
         made = make_plan(build_scene(config), build_settings(config))
-    parts = [{"name": p.name, "included": p.included, "reason": p.reason} for p in made.parts]
-    _print({"command": "plan", "config": str(given), "parts": parts}, as_json, str(made))
+    parts = [{"name": p.name, "included": p.included, "reason": p.reason, "needs": list(p.needs)} for p in made.parts]
+    report, text = {"command": "plan", "config": str(given), "parts": parts}, str(made)
+    if measure or bound is not None:
+        found, measured = advise_on(config, bound)
+        report, text = report | measured, f"{text}\n\n{found}"
+    _print(report, as_json, text)
 
 
 @app.command(epilog=_examples("jvr info head.nii.gz", "jvr info embryo.raw --shape 256,256,256 --dtype uint8 --json"))

@@ -56,6 +56,10 @@ class DeepShadowMap(AbstractShadows):
             maps.append(_deep_map(space, clear, self.layers, self.error))
         return DeepVisibility(scene.volume.world_from_grid, tuple(maps))
 
+    def coarser(self) -> tuple[AbstractShadows, ...]:
+        fewer = DeepShadowMap(max(self.texels // 2, 2), self.layers, error=self.error)
+        return fewer, DeepShadowMap(self.texels, max(self.layers // 2, 1), error=self.error)
+
 
 class ShadowStats(NamedTuple):
     """How well the pieces of a deep shadow map follow the transmittance: the share of rays that ran out of pieces, and the largest error

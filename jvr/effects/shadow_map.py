@@ -65,6 +65,10 @@ class ShadowMap(AbstractShadows):
         _, _, length = space.ray(jnp.zeros_like(spacing), jnp.zeros_like(spacing))
         return DepthMap(space, w + self.bias * spacing / length)
 
+    def coarser(self) -> tuple[AbstractShadows, ...]:
+        chosen = {"threshold": self.threshold, "bias": self.bias}
+        return (ShadowMap(max(self.texels // 2, 2), softness=self.softness, **chosen),)
+
 
 class DepthMap(eqx.Module):
     """The depth `w` from which on each ray of a light is dark, infinite where it never is."""

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from jvr.effects.shadow_volume import ShadowVolume
 from jvr.march.adjoint import replay_march
 from jvr.march.fields import VoxelField
 from jvr.march.march import AbstractVisibility, Marched, MarchOptions, Medium, march
@@ -42,6 +43,9 @@ class ShadowRays(AbstractShadows):
 
     def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         return RayVisibility(scene.clipping, lights, medium, self.step * spacing, MarchOptions(self.termination, distance=False))
+
+    def coarser(self) -> tuple[AbstractShadows, ...]:
+        return ShadowRays(2 * self.step, termination=self.termination), ShadowVolume(1.0), ShadowVolume()
 
 
 class RayVisibility(AbstractVisibility):

@@ -41,6 +41,9 @@ class ShadowVolume(AbstractShadows):
         nodes = max(2, math.ceil(self.resolution * diagonal))
         return depth_visibility(scene, lights, medium, nodes + 1, nodes, math.ceil(0.5 / self.resolution))
 
+    def coarser(self) -> tuple[AbstractShadows, ...]:
+        return (ShadowVolume(self.resolution / 2),)
+
 
 class OpacityShadowMap(AbstractShadows):
     """A map of rays with the transmittance at equally distant layers (Kim and Neumann 2001), linear in between.
@@ -62,6 +65,9 @@ class OpacityShadowMap(AbstractShadows):
 
     def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         return depth_visibility(scene, lights, medium, self.texels, self.layers, samples_a_layer(scene, self.layers))
+
+    def coarser(self) -> tuple[AbstractShadows, ...]:
+        return OpacityShadowMap(max(self.texels // 2, 2), self.layers), OpacityShadowMap(self.texels, max(self.layers // 2, 1))
 
 
 class ClearGrid(eqx.Module):

@@ -23,7 +23,7 @@ from jvr.fitting.work import Work, fingerprint
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import render
-from jvr.rendering.plan import needs_gradient
+from jvr.rendering.medium import needs_gradient
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
 

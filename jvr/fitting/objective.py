@@ -22,7 +22,7 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
 from jvr.rendering.image import composite, step_length, trace
-from jvr.rendering.plan import needs_gradient
+from jvr.rendering.medium import needs_gradient
 from jvr.rendering.settings import Settings
 from jvr.types import Scalar, Triple
 

@@ -16,7 +16,7 @@ from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import Seen, enter, step_length
-from jvr.rendering.plan import medium, occupancy, visibility
+from jvr.rendering.medium import medium, occupancy, visibility
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
 from jvr.types import Triple

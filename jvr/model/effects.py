@@ -1,6 +1,7 @@
 """What effects promise, so that a scene can hold them and no module of theirs is imported where it does not."""
 
 import abc
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -54,3 +55,17 @@ class AbstractShadows(eqx.Module):
     def prepared(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
         """A `jvr.march.march.AbstractVisibility` of these lights, made once for a picture; differentiable. `medium`: what light passes
         through, a `jvr.march.march.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""
+
+    def coarser(self) -> tuple["AbstractShadows", ...]:
+        """Cheaper ways to about the same shadows, one notch coarser."""
+        return ()
+
+
+def describe(part: Any) -> str:
+    """A part of a scene with its static choices, such as `ShadowRays(step=1, termination=0.001)`; nothing for `None`."""
+    if part is None:
+        return ""
+    fields = [f.name for f in dataclasses.fields(part) if f.metadata.get("static")]
+    chosen = ", ".join(f"{name}={getattr(part, name):g}" for name in fields if not isinstance(getattr(part, name), str))
+    inner = "".join(f", {type(x).__name__}" for x in vars(part).values() if isinstance(x, eqx.Module))
+    return f"{type(part).__name__}({(chosen + inner).removeprefix(', ')})"

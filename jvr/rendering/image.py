@@ -14,8 +14,8 @@ from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
+from jvr.rendering.medium import medium, occupancy, visibility
 from jvr.rendering.parts import in_parts, is_traced
-from jvr.rendering.plan import medium, occupancy, visibility
 from jvr.rendering.sampling import RefinementStats, SliceStats
 from jvr.rendering.settings import Settings
 from jvr.types import Image, Scalar, Triple

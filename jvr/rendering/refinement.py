@@ -18,8 +18,8 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero
 from jvr.rendering.image import Rendering, RenderStats, Seen, composite, enter, one_precision, seen, step_length
+from jvr.rendering.medium import medium
 from jvr.rendering.pixels import ImagePlane, image_plane
-from jvr.rendering.plan import medium
 from jvr.rendering.sampling import Refinement, RefinementStats
 from jvr.rendering.settings import Settings
 

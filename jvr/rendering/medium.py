@@ -1,0 +1,104 @@
+"""What rays march through for a scene: what the scene does not name is not in it.
+
+Modules of effects are imported here and only for scenes that hold them; everything else about them is behind the interfaces of
+`jvr.model.effects`.
+"""
+
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+
+from jvr.march.fields import VoxelField
+from jvr.march.march import AbstractShader, AbstractVisibility, Medium
+from jvr.march.occupancy import Occupancy, occupancy_of
+from jvr.march.quadrature import PreIntegrated
+from jvr.march.shaders import GradientFrame, OpticalShader, PreIntegratedShader
+from jvr.model.bricks import bricks_of
+from jvr.model.light import AbstractLight, AmbientLight
+from jvr.model.normals import AbstractNormals
+from jvr.model.optical import AbsorptionOnly
+from jvr.model.preintegration import PreIntegratedTable
+from jvr.model.scene import Scene
+from jvr.rendering.settings import Settings
+
+
+def medium(
+    scene: Scene, settings: Settings, occupancy: Occupancy | None = None, shadows: AbstractVisibility | None = None
+) -> Medium:
+    """What of a scene rays march through: what the scene does not name is not in it."""
+    frame, normals = _gradients(scene)
+    field = VoxelField(scene.volume, normals)
+    quadrature = settings.quadrature
+    pre_integrated = isinstance(quadrature, PreIntegrated)
+    if scene.shading is None and scene.scattering is None:
+        shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
+    else:
+        shader = _lit_shader(scene, frame, pre_integrated)
+    if not isinstance(quadrature, PreIntegrated):
+        return Medium(field, scene.transfer, shader, occupancy, shadows)
+    # Checks the transfer function's type itself.
+    table = PreIntegratedTable(cast(Any, scene.transfer), quadrature.parts)
+    return Medium(field, table, shader, occupancy, shadows)
+
+
+def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool) -> AbstractShader:
+    from jvr.effects.lighting import LitPreIntegratedShader, LitShader
+
+    kind = LitPreIntegratedShader if pre_integrated else LitShader
+    ambient = tuple(light for light in scene.lights if isinstance(light, AmbientLight))
+    lights, volume = arriving_lights(scene), scene.volume
+    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering)
+
+
+def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
+    """How gradients come about, where something asks for them."""
+    if not needs_gradient(scene):
+        return None, None
+    if scene.normals.of_opacity and scene.transfer.takes_gradient:
+        raise ValueError("a transfer function of the gradient needs that of the scalar: set normals=...(of_opacity=False)")
+    normals = scene.normals.prepared(scene.volume, scene.transfer)
+    return GradientFrame(scene.normals, scene.volume.axes_inverse, scene.volume.shape), normals
+
+
+def needs_gradient(scene: Scene) -> bool:
+    """Whether anything in a scene asks for gradients."""
+    return scene.shading is not None or scatters_by_gradient(scene) or scene.transfer.takes_gradient
+
+
+def scatters_by_gradient(scene: Scene) -> bool:
+    """Whether the medium scatters only where the gradient is weak."""
+    return scene.scattering is not None and scene.scattering.needs_gradient
+
+
+def arriving_lights(scene: Scene) -> tuple[AbstractLight, ...]:
+    """The lights that come from one direction at each point."""
+    return tuple(light for light in scene.lights if isinstance(light, AbstractLight))
+
+
+def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility | None:
+    """What says how much light reaches a point, or `None` where nothing casts shadows. Made once for a picture."""
+    if scene.shadows is None:
+        return None
+    frame, normals = _gradients(scene) if scene.transfer.takes_gradient else (None, None)
+    absorbing = Medium(VoxelField(scene.volume, normals), scene.transfer, OpticalShader(AbsorptionOnly(), frame), occupancy)
+    return scene.shadows.prepared(scene, arriving_lights(scene), absorbing, jnp.min(scene.volume.spacing))
+
+
+def occupancy(scene: Scene, settings: Settings) -> Occupancy | None:
+    """Which bricks of a scene are visible, or `None` where nothing is to be skipped."""
+    if not settings.skipping:
+        return None
+    volume = scene.volume
+    bricks = volume.bricks
+    if bricks is None and isinstance(volume.values, Tracer):
+        bricks = bricks_of(jax.lax.stop_gradient(volume.values))
+    elif bricks is None:
+        # Voxels that a traced function closes over are constants; the compiler would fold all of this, and takes seconds for it.
+        with jax.ensure_compile_time_eval():
+            bricks = volume.bricked().bricks
+    assert bricks is not None
+    # No ray is longer than the volume's diameter, so that the optical depth of all that is skipped stays below the bound.
+    least = jax.lax.stop_gradient(settings.negligible / (2 * volume.radius)) if settings.negligible else None
+    return occupancy_of(bricks, volume.slope, volume.intercept, scene.transfer, least)
