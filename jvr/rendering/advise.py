@@ -90,7 +90,7 @@ def advise(
         )
     picture, seconds = _timed(scene, camera, settings, repeats)
     contributions, candidates = [], []
-    for effect, change in _effects(scene):
+    for effect, change in effects_of(scene):
         rmse, without = _difference(change, (scene, settings), camera, picture, repeats)
         contributions.append(Contribution(effect, rmse, 1 - without / seconds))
         candidates.append((f"drop {effect}", change, rmse, without))
@@ -99,10 +99,12 @@ def advise(
         for name, change in _coarser(scene, settings):
             candidates.append((name, change, *_difference(change, (scene, settings), camera, picture, repeats)))
         proposal = _proposal(candidates, (scene, settings), camera, picture, seconds, tolerance, repeats)
-    return Advice(seconds, tuple(contributions), tuple(_remarks(scene, camera, settings)), proposal)
+    return Advice(
+        seconds, tuple(contributions), tuple(remarks_on(scene, render(scene, camera, settings).stats.shadows)), proposal
+    )
 
 
-def _effects(scene: Scene) -> Iterator[tuple[str, Change]]:
+def effects_of(scene: Scene) -> Iterator[tuple[str, Change]]:
     """Every effect that a scene may do without, and how."""
     lit = scene.shading is not None or scene.scattering is not None
     if scene.shadows is not None:
@@ -196,8 +198,8 @@ def _rms(difference: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(difference))))
 
 
-def _remarks(scene: Scene, camera: AbstractCamera, settings: Settings) -> Iterator[str]:
-    """What a present value cannot show."""
+def remarks_on(scene: Scene, shadow_stats: Any) -> Iterator[str]:
+    """What a present value cannot show, and what shadows have to report."""
     for i, light in enumerate(scene.lights):
         strength = next(getattr(light, name) for name in ("irradiance", "intensity", "radiance") if hasattr(light, name))
         if not np.any(np.asarray(strength)):
@@ -212,9 +214,8 @@ def _remarks(scene: Scene, camera: AbstractCamera, settings: Settings) -> Iterat
         yield "scattering.albedo is zero everywhere: nothing is scattered"
     if scene.shading is not None and all(_is_zero(getattr(scene.shading, k, 0.0)) for k in ("diffuse", "specular")):
         yield "shading.diffuse and shading.specular are zero: nothing but ambient light is reflected"
-    stats = render(scene, camera, settings).stats.shadows
-    if stats is not None and float(stats.overflow) > 0:
-        share, error = float(stats.overflow), float(stats.error)
+    if shadow_stats is not None and float(shadow_stats.overflow) > 0:
+        share, error = float(shadow_stats.overflow), float(shadow_stats.error)
         yield f"{share:.0%} of the rays of a deep shadow map ran out of layers (error {error:.2g}): give it more"
 
 
