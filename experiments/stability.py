@@ -101,8 +101,8 @@ def base(
 
 
 def oblique() -> np.ndarray:
-    """A `world_from_grid` that is turned, anisotropic and sheared: where all corners are equally far from the middle, how far a map of a point
-    light has to reach has a kink."""
+    """A `world_from_grid` that is turned, anisotropic and sheared: where all corners are equally far from the middle, how far a map of a
+    point light has to reach has a kink."""
     turn, _ = np.linalg.qr(np.array([[0.6, 0.3, -0.2], [0.1, 0.9, 0.4], [-0.5, 0.2, 0.8]]))
     shear = np.array([[1, 0.1, -0.05], [0, 1, 0.15], [0, 0, 1]])
     matrix = np.eye(4)
