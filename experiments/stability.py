@@ -132,7 +132,7 @@ def rows(quick: bool = False) -> dict[str, list[Case]]:
     """The hard cases by their row of the table."""
     pick = lambda values: values[:: max(1, len(values) // 3)] if quick else values
     depths = pick([0.0, 1e-20, 1e-6, 1e-3, 1.0, 1e2, 1e4, 1e6, 1e8])
-    unit = {"world": np.eye(4)}
+    unit: dict[str, Any] = {"world": np.eye(4)}
     step = np.nextafter(np.float32(0.5), np.float32(1))
     eye, middle = np.array([9.0, -5, 7]), np.array([2.0, 2.5, 3.0])
     view = (middle - eye) / np.linalg.norm(middle - eye)

@@ -26,6 +26,7 @@ def test_hard_cases():
         assert row["gradient"] < GRADIENT, row
 
 
+@pytest.mark.slow
 def test_an_opaque_medium_keeps_its_digits():
     """Depth 0, 1e-3, 1e4 to the eye and to both lights."""
     ways = stability.compiled_ways(compiled)
