@@ -15,7 +15,7 @@ import numpy as np
 from jvr.model.by_value import ByValue, coefficient
 from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractShading
-from jvr.numerics import direction_and_length, dot
+from jvr.numerics import direction_and_length, divide_or_zero, dot
 from jvr.types import ArrayLike, Scalar, Triple
 
 
@@ -141,7 +141,7 @@ def power_of_cosine(a: Triple, b: Triple, exponent: Scalar) -> Scalar:
 def share_of(magnitude: Scalar, threshold: Scalar) -> Scalar:
     """`m^2 / (m^2 + t^2)`, by the ratio of the smaller to the larger, so that no square overflows; 0 where `m` is 0."""
     larger, smaller = jnp.maximum(magnitude, threshold), jnp.minimum(magnitude, threshold)
-    ratio = jnp.square(smaller / jnp.where(larger > 0, larger, 1.0))
+    ratio = jnp.square(divide_or_zero(smaller, larger))
     share = jnp.where(magnitude >= threshold, 1 / (1 + ratio), ratio / (1 + ratio))
     # A gradient that vanishes has no normal, whatever the threshold.
     return jnp.where(magnitude > 0, share, jax.lax.stop_gradient(jnp.zeros_like(magnitude)))

@@ -72,7 +72,7 @@ class AbstractDifferences(AbstractNormals):
     offsets: ClassVar[tuple[tuple[int, int, int], ...]]
 
     @abc.abstractmethod
-    def difference(self, shape: tuple[int, int, int], p: Triple, center: Scalar, around: Channels) -> Triple:
+    def difference(self, shape: tuple[int, int, int], p: Triple, center: Float[Array, "..."], around: Channels) -> Triple:
         """The gradient from values at `p` and at the neighbours."""
 
     def neighbour(self, shape: tuple[int, int, int], p: Triple, offset: tuple[int, int, int]) -> Triple:
@@ -103,7 +103,7 @@ class AbstractDifferences(AbstractNormals):
         return self.difference(shape, p, extinction(transfer, s), tuple(extinction(transfer, x) for x in around))
 
 
-def _span(shape: tuple[int, int, int], p: Triple, axis: int, before: int, after: int) -> Scalar:
+def _span(shape: tuple[int, int, int], p: Triple, axis: int, before: int, after: int) -> Float[Array, "..."]:
     """Distance between the neighbours `before` and `after` on an axis, as far as they are inside of the domain."""
     last = shape[axis] - 1
     return jnp.clip(p[axis] + after, 0, last) - jnp.clip(p[axis] + before, 0, last)
@@ -118,7 +118,7 @@ class ForwardDifferences(AbstractDifferences):
         inwards = [jnp.where(x + o > n - 1, -o, o) if n > 1 else 0 for x, o, n in zip(p, offset, shape, strict=True)]
         return tuple(x + o for x, o in zip(p, inwards, strict=True))
 
-    def difference(self, shape: tuple[int, int, int], p: Triple, center: Scalar, around: Channels) -> Triple:
+    def difference(self, shape: tuple[int, int, int], p: Triple, center: Float[Array, "..."], around: Channels) -> Triple:
         signs = [jnp.where(x + 1 > n - 1, -1.0, 1.0) if n > 1 else 0.0 for x, n in zip(p, shape, strict=True)]
         return tuple(sign * (value - center) for sign, value in zip(signs, around, strict=True))
 
@@ -128,7 +128,7 @@ class CentralDifferences(AbstractDifferences):
 
     offsets: ClassVar = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
 
-    def difference(self, shape: tuple[int, int, int], p: Triple, center: Scalar, around: Channels) -> Triple:
+    def difference(self, shape: tuple[int, int, int], p: Triple, center: Float[Array, "..."], around: Channels) -> Triple:
         return tuple(divide_or_zero(around[2 * a + 1] - around[2 * a], _span(shape, p, a, -1, 1)) for a in range(3))
 
 
@@ -137,8 +137,8 @@ class SobelDifferences(AbstractDifferences):
 
     offsets: ClassVar = tuple((i, j, k) for i, j, k in itertools.product((-1, 0, 1), repeat=3) if (i, j, k) != (0, 0, 0))
 
-    def difference(self, shape: tuple[int, int, int], p: Triple, center: Scalar, around: Channels) -> Triple:
-        def along(axis: int) -> Scalar:
+    def difference(self, shape: tuple[int, int, int], p: Triple, center: Float[Array, "..."], around: Channels) -> Triple:
+        def along(axis: int) -> Float[Array, "..."]:
             total = jnp.zeros_like(center)
             for offset, value in zip(self.offsets, around, strict=True):
                 smooth = [2 - abs(o) for a, o in enumerate(offset) if a != axis]

@@ -84,7 +84,7 @@ class LinearTransfer(AbstractTable):
         i = jnp.clip(above - 1, 0, n - 2)
         low, high = self.positions[i], self.positions[i + 1]
         # Clamped before the division: far outside of a narrow interval the quotient would overflow.
-        fraction = (jnp.clip(s, low, high) - low) / (high - low)
+        fraction = divide_or_zero(jnp.clip(s, low, high) - low, high - low)
         return i + fraction
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
