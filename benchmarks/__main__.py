@@ -12,24 +12,27 @@ import jax
 
 import jvr
 from benchmarks.cases import CASES
-from benchmarks.peers.run import peers
+from benchmarks.peers.run import peers, scattering
 
 
 def main() -> None:
-    """Runs the named measurements, all by default, and prints one JSON object."""
+    """Runs the named measurements, all by default, and prints one JSON object. `scattering` is a part of `peers`, also to be had alone."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    names = [*CASES, "peers"]
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)}; all by default")
+    beside = {"peers": peers, "scattering": scattering}
+    names = [*CASES, *beside]
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)} (a part of peers); all by default")
     parser.add_argument("--json", metavar="FILE", help="also write the result to FILE")
-    parser.add_argument("--quick", action="store_true", help="peers: small sizes and few rounds, to see that it runs")
+    parser.add_argument(
+        "--quick", action="store_true", help="peers and scattering: small sizes and few rounds, to see that it runs"
+    )
     arguments = parser.parse_args()
     unknown = set(arguments.names) - set(names)
     if unknown:
         parser.error(f"unknown benchmark {', '.join(sorted(unknown))}: choose from {', '.join(names)}")
     result = {"machine": machine()}
-    for name in arguments.names or names:
+    for name in arguments.names or [*CASES, "peers"]:
         print(f"{name} ...", file=sys.stderr, flush=True)
-        result[name] = peers(arguments.quick) if name == "peers" else CASES[name]()
+        result[name] = beside[name](arguments.quick) if name in beside else CASES[name]()
     text = json.dumps(result, indent=2)
     print(text)
     if arguments.json:

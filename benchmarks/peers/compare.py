@@ -1,10 +1,11 @@
 """Pictures at equal error, and times in turns."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from benchmarks.peers.settings import STEPS
 from benchmarks.peers.worker import Worker
@@ -26,9 +27,9 @@ def running(names: list[str], *arguments: Any) -> Iterator[tuple[dict[str, Worke
         yield workers, failed
 
 
-def error_at(worker: Worker, step: float, reference: np.ndarray) -> float:
-    """Draws with a step, and compares."""
-    worker.call("prepare", step)
+def error_at(worker: Worker, step: float, reference: np.ndarray, *choices: Any) -> float:
+    """Draws with a step and what else there is to choose, and compares."""
+    worker.call("prepare", step, *choices)
     worker.call("draw")
     return worker.call("error", reference)
 
@@ -55,6 +56,33 @@ def longest_step(worker: Worker, reference: np.ndarray, target: float) -> tuple[
     good = [step for step, error in errors.items() if error <= target]
     chosen = max(good) if good else min(errors, key=lambda step: errors[step])
     return chosen, errors[chosen]
+
+
+def z_test(pictures: Sequence[np.ndarray], reference: np.ndarray) -> dict[str, float]:
+    """Whether independent noisy pictures have the reference as their mean, pixel by pixel of the first channel.
+
+    `z` is the difference of a pixel's mean over its standard error, both from the pictures, so that it follows Student's distribution.
+    `mean_z` and `mean_square_z` come with what is expected and the standard error of that, `share_beyond_3` with what is expected;
+    `brightness` is the mean of all pixels over that of the reference.
+    """
+    first, n = np.stack(pictures).astype(float)[..., 0], len(pictures)
+    z = (first.mean(axis=0) - reference[..., 0]) / (first.std(axis=0, ddof=1) / np.sqrt(n))
+    student = stats.t(n - 1)
+    square, fourth = (float(student.moment(k)) for k in (2, 4))
+    totals = first.mean(axis=(1, 2)) / reference[..., 0].mean()
+    return {
+        "pixels": z.size,
+        "mean_z": float(z.mean()),
+        "mean_z_expected": 0.0,
+        "mean_z_deviation": float(np.sqrt(square / z.size)),
+        "mean_square_z": float(np.mean(z**2)),
+        "mean_square_z_expected": square,
+        "mean_square_z_deviation": float(np.sqrt((fourth - square**2) / z.size)),
+        "share_beyond_3": float(np.mean(np.abs(z) > 3)),
+        "share_beyond_3_expected": float(2 * student.sf(3)),
+        "brightness": float(totals.mean()),
+        "brightness_deviation": float(totals.std(ddof=1) / np.sqrt(n)),
+    }
 
 
 def in_turns(functions: dict[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:

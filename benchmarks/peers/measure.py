@@ -6,8 +6,11 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
+import jvr
 from benchmarks.peers import scenes
-from benchmarks.peers.compare import NEAR_BEST, error_at, in_turns, longest_step, near_best, running
+from benchmarks.peers.compare import NEAR_BEST, error_at, in_turns, longest_step, near_best, running, z_test
 from benchmarks.peers.scenes import Scene
 from benchmarks.peers.worker import Worker
 from benchmarks.timing import median, ratio
@@ -15,6 +18,13 @@ from benchmarks.timing import median, ratio
 USUAL_STEP = 0.5
 # Where the packed one reaches the error, too, the faster of the two counts.
 OURS = ("jvr", "jvr_packed")
+# Of Mitsuba's picture of single scattering, whose error is then the target.
+USUAL_SAMPLES = 64
+# What jvr may choose from there: steps in voxels, and shadows.
+LIT_STEPS = (16.0, 8.0, 4.0, 2.0, 1.0)
+SHADOWS = (jvr.ShadowVolume(1 / 16), jvr.ShadowVolume(1 / 8), jvr.ShadowRays(8))
+# A view in which the medium fills the picture: at its rim, a pixel's mean takes more rays than a reference can spare.
+NARROW = 16.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,11 +38,13 @@ class Sizes:
     gradient_growth: tuple[int, ...]
     fit_picture: int
     absorption_error: float
+    agreement: tuple[int, int, int]
+    """Pictures a side, samples per pixel of each, and how many."""
     repeats: int
 
 
-FULL = Sizes(128, 256, 128, (64, 128, 256, 512), (64, 128, 256), 128, 0.01, 7)
-QUICK = Sizes(48, 64, 48, (32, 64), (32, 64), 48, 0.05, 2)
+FULL = Sizes(128, 256, 128, (64, 128, 256, 512), (64, 128, 256), 128, 0.01, (48, 1024, 32), 7)
+QUICK = Sizes(48, 64, 48, (32, 64), (32, 64), 48, 0.05, (16, 64, 16), 2)
 
 
 def forward(scene: Scene, present: list[str], repeats: int) -> dict[str, Any]:
@@ -109,6 +121,32 @@ def absorption(scene: Scene, target: float, present: list[str], repeats: int) ->
         }
 
 
+def scattering(scene: Scene, sizes: Sizes, present: list[str]) -> dict[str, Any]:
+    """Light that is scattered once: whether Mitsuba and the reference agree within noise, and the time of both at the error of
+    Mitsuba's usual number of samples, `jvr` with the steps and shadows that are fastest there."""
+    if "mitsuba" not in present:
+        return {"failed": "Mitsuba is not installed"}
+    centres, areas = _reference(scene, "picture"), _reference(scene, "picture", 2)
+    with running(["mitsuba", "jvr"], scene) as (workers, failed):
+        if failed:
+            return {"failed": str(failed)}
+        target = error_at(workers["mitsuba"], USUAL_SAMPLES, areas)
+        step, error, shadows = _fastest_lit(workers["jvr"], centres, target)
+        chosen = {"mitsuba": (USUAL_SAMPLES, target), "jvr": (step, error)}
+        workers["jvr"].call("prepare", step, shadows)
+        times = _times(workers, "draw", sizes.repeats)
+        rows = _rows(workers, chosen, times, "draw", target)
+        rows["mitsuba"]["samples_per_pixel"] = rows["mitsuba"].pop("step")
+        rows["jvr"]["shadows"] = repr(shadows)
+        return {
+            **_about(scene),
+            "target_rmse": target,
+            "renderers": rows,
+            "over_jvr": {"mitsuba": ratio(times, "mitsuba", "jvr")},
+            "agreement": _agreement(scene, *sizes.agreement),
+        }
+
+
 def fit(size: int, present: list[str], repeats: int) -> dict[str, Any]:
     """A Levenberg-Marquardt fit to 60 dB beside one gradient over the same views in PyTorch, the same step for both."""
     with Worker("fit").load(size) as ours, contextlib.ExitStack() as stack:
@@ -149,6 +187,33 @@ def opengl(present: list[str]) -> str | None:
         worker.call("prepare", USUAL_STEP)
         worker.call("draw")
         return worker.call("device")
+
+
+def _fastest_lit(worker: Worker, reference: np.ndarray, target: float) -> tuple[float, float, Any]:
+    """Step, error and shadows of the fastest picture with at most this error; where none is, of the one with the smallest. For each kind
+    of shadows the longest step that reaches it is tried."""
+    errors, seconds = {}, {}
+    for shadows in SHADOWS:
+        for step in LIT_STEPS:
+            errors[step, shadows] = error_at(worker, step, reference, shadows)
+            if errors[step, shadows] <= target:
+                seconds[step, shadows] = min(worker.seconds("draw") for _ in range(5))
+                break
+    step, shadows = min(seconds, key=lambda one: seconds[one]) if seconds else min(errors, key=lambda one: errors[one])
+    return step, errors[step, shadows], shadows
+
+
+def _agreement(scene: Scene, size: int, samples: int, pictures: int) -> dict[str, float]:
+    """A Z-test of Mitsuba's pictures against the reference."""
+    close = dataclasses.replace(scene, view=dataclasses.replace(scene.view, width=size, height=size, fov_y=NARROW))
+    reference = _reference(close, "picture", 3)
+    with Worker("mitsuba").load(close) as worker:
+        worker.call("prepare", samples)
+        drawn = []
+        for _ in range(pictures):
+            worker.call("draw")
+            drawn.append(worker.call("picture"))
+    return {"samples_per_pixel": samples, "pictures": pictures, **z_test(drawn, reference)}
 
 
 def _to_goal(worker: Worker) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import jvr
 from benchmarks.peers import scenes
 from benchmarks.peers.errors import relative, rmse
-from benchmarks.peers.settings import REFERENCE_STEP, TERMINATION
+from benchmarks.peers.settings import LIT_REFERENCE_STEP, REFERENCE_STEP, TERMINATION
 
 ENTRIES = lambda scene: (scene.transfer.rgb, scene.transfer.sigma_t)
 
@@ -26,7 +26,10 @@ class Renderer:
     def __init__(self, scene: scenes.Scene):
         self.scene, self.camera = _scene(scene), _camera(scene.view)
 
-    def prepare(self, step: float) -> None:
+    def prepare(self, step: float, shadows: Any = None) -> None:
+        """`shadows` is one of jvr's, for a scene that is lit."""
+        if shadows is not None:
+            self.scene = _shaded(self.scene, shadows)
         settings = jvr.Settings(step, termination=TERMINATION)
         self._image = lambda scene, camera: jvr.render(scene, camera, settings).rgb
         loss = lambda entries, scene, camera: _loss(entries, scene, camera, settings)
@@ -61,13 +64,16 @@ class Packed(Renderer):
 
 
 class Reference:
-    """The same scene in float64, with short steps, every ray to its end, nothing skipped."""
+    """The same scene in float64, with short steps, every ray to its end, nothing skipped; shadows by rays, with the same steps."""
 
     def __init__(self, scene: scenes.Scene):
         if jnp.zeros(()).dtype != jnp.float64:
             raise RuntimeError("the reference needs JAX_ENABLE_X64=1")
         self.scene, self.view = _scene(scene), scene.view
-        self.settings = jvr.Settings(REFERENCE_STEP, termination=0.0, skipping=False)
+        step = REFERENCE_STEP if scene.scattering is None else LIT_REFERENCE_STEP
+        self.settings = jvr.Settings(step, termination=0.0, skipping=False)
+        if scene.scattering is not None:
+            self.scene = _shaded(self.scene, jvr.ShadowRays(step, termination=0.0))
 
     def picture(self, across: int = 1) -> np.ndarray:
         """One ray through the centre of each pixel, or the mean of `across` x `across` rays spread over it."""
@@ -101,7 +107,16 @@ def _scene(scene: scenes.Scene) -> jvr.Scene:
     transfer = jvr.LutTransfer(scene.rgb, scene.sigma_t, scene.domain)
     if scene.absorption:
         return jvr.Scene(volume, transfer, background=(1, 1, 1), optical=jvr.AbsorptionOnly())
+    if scene.scattering is not None:
+        light = scene.scattering
+        once = jvr.SingleScattering(jvr.HenyeyGreenstein(light.g), light.albedo)
+        sun = jvr.DirectionalLight(light.direction, light.irradiance)
+        return jvr.Scene(volume, transfer, background=(0, 0, 0), lights=(sun,), scattering=once)
     return jvr.Scene(volume, transfer, background=(0, 0, 0))
+
+
+def _shaded(scene: jvr.Scene, shadows: Any) -> jvr.Scene:
+    return eqx.tree_at(lambda s: s.shadows, scene, shadows, is_leaf=lambda x: x is None)
 
 
 def _camera(view: scenes.View) -> jvr.PerspectiveCamera:

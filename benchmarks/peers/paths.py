@@ -1,4 +1,4 @@
-"""Mitsuba 3: path tracing through a heterogeneous medium. It has no transfer function: extinction is a grid of its own."""
+"""Mitsuba 3: path tracing through a medium, homogeneous or not. It has no transfer function: extinction is a grid of its own."""
 
 import drjit  # pyright: ignore[reportMissingImports]
 import mitsuba  # pyright: ignore[reportMissingImports]
@@ -34,11 +34,12 @@ def version() -> str:
 
 
 class Renderer:
-    """A scene that only absorbs, before a white environment; its error falls with the root of the number of samples per pixel."""
+    """A scene that only absorbs, before a white environment, or that scatters light once; its error falls with the root of the number
+    of samples per pixel."""
 
     def __init__(self, scene: Scene):
-        if not scene.absorption:
-            raise ValueError("only media that absorb: Mitsuba's have neither a transfer function nor emission")
+        if not scene.absorption and scene.scattering is None:
+            raise ValueError("only media that absorb or scatter: Mitsuba's have neither a transfer function nor emission")
         self.scene, self.seed = mitsuba.load_dict(_description(scene)), 0
 
     def prepare(self, samples: int) -> None:
@@ -69,16 +70,28 @@ def _description(scene: Scene) -> dict:
         "wrap_mode": "clamp",
         "raw": True,
     }
-    view = scene.view
+    view, scattering = scene.view, scene.scattering
+    if np.ptp(extinction) > 0:
+        interior = {"type": "heterogeneous", "sigma_t": grid}
+    else:
+        interior = {"type": "homogeneous", "sigma_t": float(extinction.flat[0])}
+    if scattering is None:
+        deepest, light = -1, {"type": "constant", "radiance": 1.0}
+        interior |= {"albedo": 0.0}
+    else:
+        # One edge from the light to where it is scattered, one from there to the eye.
+        deepest = 2
+        light = {"type": "directional", "direction": list(scattering.direction), "irradiance": scattering.irradiance}
+        interior |= {"albedo": scattering.albedo, "phase": {"type": "hg", "g": scattering.g}}
     return {
         "type": "scene",
-        "integrator": {"type": "volpath", "max_depth": -1, "rr_depth": 1000},
-        "light": {"type": "constant", "radiance": 1.0},
+        "integrator": {"type": "volpath", "max_depth": deepest, "rr_depth": 1000},
+        "light": light,
         "medium": {
             "type": "cube",
             "to_world": box(low + scene.hull / 2, scene.hull / 2),
             "bsdf": {"type": "null"},
-            "interior": {"type": "heterogeneous", "sigma_t": grid, "albedo": 0.0},
+            "interior": interior,
         },
         "camera": {
             "type": "perspective",

@@ -1,4 +1,5 @@
-"""The page of results: `python -m benchmarks.peers.report RUN.json PAGE.md` replaces what stands between two marks in the page."""
+"""The page of results: `python -m benchmarks.peers.report RUN.json PAGE.md` replaces what stands between marks in the page: all results
+by those of `python -m benchmarks peers`, those of single scattering by its own or by those of `python -m benchmarks scattering`."""
 
 import json
 import sys
@@ -6,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-BEGIN, END = "<!-- results -->", "<!-- end of results -->"
 NAMES = {
     "jvr": "jvr",
     "jvr_packed": "jvr, 8 bits packed",
@@ -22,6 +22,7 @@ FIGURES = {
     "forward_jvr_over_compiled": "picture, jvr / C++ loop, worst of the scenes",
     "gradient_torch_over_jvr": "picture and gradient, PyTorch / jvr, worst of the scenes",
     "absorption_mitsuba_over_jvr": "absorbing medium, Mitsuba / jvr",
+    "scattering_mitsuba_over_jvr": "single scattering, Mitsuba / jvr, worst of the media",
     "fit_over_torch_gradient": "whole fit to 60 dB in jvr / one gradient over the same views in PyTorch",
     "picture_in_8_times_the_box": "jvr, the same object in a box of 8 times the volume: picture",
     "gradient_in_8_times_the_box": "the same: picture and gradient",
@@ -31,16 +32,30 @@ FIGURES = {
 
 def page(run: dict[str, Any], text: str) -> str:
     """The page with the results of this run."""
-    before, rest = text.split(BEGIN)
-    _, after = rest.split(END)
-    return f"{before}{BEGIN}\n\n{results(run)}\n\n{END}{after}"
+    if "peers" in run:
+        text = _replaced(text, "results", results(run))
+    scattered = run.get("scattering") or run["peers"]
+    return _replaced(text, "scattering", scattering(run["machine"], scattered)) if "scattering" in scattered else text
+
+
+def _replaced(text: str, name: str, part: str) -> str:
+    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    before, rest = text.split(begin)
+    _, after = rest.split(end)
+    return f"{before}{begin}\n\n{part}\n\n{end}{after}"
 
 
 def results(run: dict[str, Any]) -> str:
     """All tables of a run, as Markdown."""
     peers = run["peers"]
     figures = [[FIGURES.get(name, name.replace("_", " ")), _number(value)] for name, value in peers["figures"].items()]
-    parts: list[str] = [_machine(run), "### Figures", _table(["figure", "ratio"], figures), "### Where jvr loses", *losses(peers)]
+    parts: list[str] = [
+        _machine(run["machine"], peers),
+        "### Figures",
+        _table(["figure", "ratio"], figures),
+        "### Where jvr loses",
+        *losses(peers),
+    ]
     sections = {
         "Pictures": ("forward", "jvr_over", "jvr / {}"),
         "Pictures of a growing sparse volume": ("growth", "jvr_over", "jvr / {}"),
@@ -51,9 +66,23 @@ def results(run: dict[str, Any]) -> str:
         parts += [f"### {title}", _rows(peers[name], key, ratio)]
     absorbing = peers["absorption"]
     parts += ["### Absorbing medium", _rows([absorbing], "over_jvr", "{} / jvr")]
-    parts += [f"Single scattering: {peers['single_scattering']['failed']}."]
     parts += ["### Fit", _fit(peers["fit"])]
     return "\n\n".join(parts)
+
+
+def scattering(machine: dict[str, Any], run: dict[str, Any]) -> str:
+    """Single scattering: times at equal error, and the agreement of Mitsuba with the reference."""
+    rows = run["scattering"]
+    found, close = [], lambda value, deviation: f"{value:.4f} ± {deviation:.4f}"
+    for row in (row for row in rows if "failed" not in row):
+        z = row["agreement"]
+        mean = f"{close(z['mean_z'], z['mean_z_deviation'])} (0)"
+        square = f"{close(z['mean_square_z'], z['mean_square_z_deviation'])} ({z['mean_square_z_expected']:.4f})"
+        beyond = f"{100 * z['share_beyond_3']:.2f} % ({100 * z['share_beyond_3_expected']:.2f} %)"
+        samples = f"{z['pixels']} pixels, {z['pictures']} pictures of {z['samples_per_pixel']} samples"
+        found.append([row["data"], samples, mean, square, beyond, close(z["brightness"], z["brightness_deviation"])])
+    head = ["medium", "Mitsuba", "mean z", "mean z²", "beyond 3", "brightness"]
+    return "\n\n".join([_machine(machine, run), _rows(rows, "over_jvr", "{} / jvr"), _table(head, found)])
 
 
 def losses(peers: dict[str, Any]) -> list[str]:
@@ -77,13 +106,12 @@ def _more_memory(row: dict[str, Any], title: str) -> list[tuple[float, str, str]
     return [(takers["jvr"] / taken, title, name) for name, taken in takers.items() if takers["jvr"] > taken > 0]
 
 
-def _machine(run: dict[str, Any]) -> str:
-    machine, peers = run["machine"], run["peers"]
+def _machine(machine: dict[str, Any], peers: dict[str, Any]) -> str:
     lines = [
         f"Measured on {machine['date']}: {machine['processor']}, Python {machine['python']}; "
         f"{peers['threads']} of {machine['cores']} cores used.",
         "; ".join(f"{NAMES[name]} {version}" for name, version in peers["versions"].items()) + ".",
-        f"The GPU mapper ran on {peers['opengl']}." if peers["opengl"] else "",
+        f"The GPU mapper ran on {peers['opengl']}." if peers.get("opengl") else "",
         f"Load of the machine before and after: {peers['load'][0]:.1f}, {peers['load'][1]:.1f}.",
         *(f"{NAMES[name]}: absent ({why})." for name, why in peers["absent"].items()),
     ]
@@ -105,6 +133,7 @@ def _rows(rows: list[dict[str, Any]], key: str, ratio: str) -> str:
                 lines.append([_about(row), NAMES[name], f"failed: {taken['failed']}", "", "", "", ""])
                 continue
             step = f"{taken['samples_per_pixel']} samples" if "samples_per_pixel" in taken else f"{taken['step']:.3g}"
+            step += f", {taken['shadows']}" if "shadows" in taken else ""
             error = f"{taken['rmse']:.2g}" + ("" if taken["reached"] else " (best)")
             times = [f"{taken['seconds']:.3g}", f"{taken['peak_bytes'] / 1e6:.0f}"]
             lines.append([_about(row), NAMES[name], step, error, *times, _number(row[key].get(name))])

@@ -9,8 +9,6 @@ from benchmarks.peers import measure, scenes
 from benchmarks.peers.settings import REFERENCE_STEP, TERMINATION, THREADS
 from benchmarks.peers.worker import RENDERERS, Absent, Worker
 
-SINGLE_SCATTERING = "not measured: jvr has no single scattering"
-
 
 def peers(quick: bool = False) -> dict[str, Any]:
     """`jvr` beside VTK, PyTorch, Mitsuba and a compiled loop; what is not installed is said and left out."""
@@ -38,7 +36,7 @@ def peers(quick: bool = False) -> dict[str, Any]:
             "gradient": _rows("gradient", measure.gradient, small, present, fewer),
             "gradient_growth": _rows("growth of the gradient", measure.gradient, growing_small, present, fewer),
             "absorption": _row("absorption", measure.absorption, fog, sizes.absorption_error, present, fewer),
-            "single_scattering": {"failed": SINGLE_SCATTERING},
+            "scattering": scattered(sizes, present),
             "fit": _row("fit", measure.fit, sizes.fit_picture, present, fewer),
             "empty_space": _row("empty space", measure.empty_space, sizes),
             "load": (before, _load()),
@@ -46,10 +44,24 @@ def peers(quick: bool = False) -> dict[str, Any]:
     )
 
 
-def installed() -> tuple[dict[str, str], dict[str, str]]:
+def scattering(quick: bool = False) -> dict[str, Any]:
+    """Single scattering alone."""
+    before = _load()
+    versions, absent = installed(("jvr", "mitsuba"))
+    rows = scattered(measure.QUICK if quick else measure.FULL, list(versions))
+    heads = {"quick": quick, "threads": THREADS, "versions": versions, "absent": absent}
+    return {**heads, "scattering": rows, "load": (before, _load())}
+
+
+def scattered(sizes: measure.Sizes, present: list[str]) -> list[dict[str, Any]]:
+    """One row for each medium that scatters."""
+    return _rows("scattering", measure.scattering, scenes.scattering(sizes.voxels // 2, sizes.gradient_picture), sizes, present)
+
+
+def installed(names: Iterable[str] = RENDERERS) -> tuple[dict[str, str], dict[str, str]]:
     """Versions of the renderers that are there, and why others are not."""
     versions, absent = {}, {}
-    for name in RENDERERS:
+    for name in names:
         try:
             with Worker(name) as worker:
                 versions[name] = worker.version
@@ -68,6 +80,7 @@ def _with_figures(result: dict[str, Any]) -> dict[str, Any]:
         "forward_jvr_over_compiled": most(over("forward", "jvr_over", "compiled")),
         "gradient_torch_over_jvr": least(over("gradient", "over_jvr", "torch")),
         "absorption_mitsuba_over_jvr": result["absorption"].get("over_jvr", {}).get("mitsuba"),
+        "scattering_mitsuba_over_jvr": least(over("scattering", "over_jvr", "mitsuba")),
         "fit_over_torch_gradient": result["fit"].get("fit_over_torch_gradient"),
         **{name: value for name, value in result["empty_space"].items() if name != "failed"},
     }

@@ -24,11 +24,22 @@ class View:
 
 
 @dataclasses.dataclass(frozen=True)
+class Scattering:
+    """Light that the medium scatters once: parallel light that travels along `direction`, and a Henyey-Greenstein phase function."""
+
+    direction: tuple[float, ...]
+    irradiance: float
+    albedo: float
+    g: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Scene:
     """A volume whose axes are the world's, a transfer function with equally spaced entries, and a view; black behind.
 
     `voxels`: `(x, y, z)`; voxel `(i, j, k)` sits at `origin + spacing * (i, j, k)`. `rgb` `(n, 3)` and `sigma_t` `(n,)`, per world
-    length, interpolate linearly over `domain` and clamp outside. With `absorption`, nothing is emitted and the background is white.
+    length, interpolate linearly over `domain` and clamp outside. With `absorption`, nothing is emitted and the background is white; with
+    `scattering`, nothing is emitted and all light is scattered.
     """
 
     name: str
@@ -41,6 +52,7 @@ class Scene:
     domain: tuple[float, float]
     view: View
     absorption: bool = False
+    scattering: Scattering | None = None
 
     @property
     def hull(self) -> np.ndarray:
@@ -92,6 +104,15 @@ def fog(n: int, size: int) -> Scene:
     x = np.linspace(0, 1, ENTRIES)
     scene = _scene("absorption", "gyroid", shapes.gyroid(n), 100 / (n - 1), np.zeros((ENTRIES, 3)), 0.03 * x, (-1.5, 1.5), size)
     return dataclasses.replace(scene, absorption=True)
+
+
+def scattering(n: int, size: int) -> list[Scene]:
+    """Media that scatter the light of the sun, which shines past the camera's shoulder: the same extinction everywhere, and the fog."""
+    light = Scattering(direction=(0.7, 0.5, -0.5), irradiance=10.0, albedo=0.8, g=0.5)
+    uneven = fog(n, size)
+    even = dataclasses.replace(uneven, data="homogeneous", voxels=np.full_like(uneven.voxels, 0.5))
+    changes = {"name": "scattering", "absorption": False, "scattering": light}
+    return [dataclasses.replace(scene, **changes) for scene in (even, uneven)]
 
 
 def _bone(data: str, voxels: np.ndarray, spacing: float, size: int) -> Scene:

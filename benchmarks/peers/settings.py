@@ -8,3 +8,5 @@ TERMINATION = 1e-3
 STEPS = tuple(4 * 2 ** (-i / 4) for i in range(25))
 # Of the float64 reference.
 REFERENCE_STEP = 1 / 16
+# The same where every sample sends a ray to the light.
+LIT_REFERENCE_STEP = 1 / 2
