@@ -10,6 +10,8 @@ import numpy as np
 import jvr
 
 DATA = Path(os.environ.get("JVR_DATA", "data"))
+# In that folder.
+HEAD = "ct_head_quarter/ct_head_quarter.mhd"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +45,7 @@ def diffdvr(entries: int = 64, size: int = 256) -> Protocol | None:
 
 def head_volume() -> jvr.Volume | None:
     """`ct_head_quarter`, divided by 2500 and clamped to 0 ... 1."""
-    path = DATA / "ct_head_quarter" / "ct_head_quarter.mhd"
+    path = DATA / HEAD
     if not path.exists():
         return None
     raw = jvr.read_volume(path)

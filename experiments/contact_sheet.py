@@ -1,0 +1,261 @@
+"""Every effect of light on one sheet: on a CT of a head (`ct_head_quarter`, looked for in `$JVR_DATA`) and on the embedded volume.
+
+`python experiments/contact_sheet.py [-o FILE] [--json FILE] [--quick]`; `--figure` is another name of `-o`. Both scenes come from
+configurations (`configs/real/ct_head_lit.toml`, `configs/lit.toml`), and each picture changes the one thing that its title names; JSON
+holds its seconds (compilation included) and its mean and largest radiance.
+"""
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import jvr
+from experiments.protocols import DATA, HEAD
+from jvr.io.config import build_cameras, build_scene, build_settings, read_config
+from jvr.io.images import srgb_from_linear
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+COLUMNS = 6
+# Voxels of every volume.
+SHAPE = (64, 64, 93)
+# What share of a picture a detail shows.
+DETAIL = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """A lit scene, what sees it, and what depends on its units: lengths of the gradient of its surfaces, the share of its extinction that
+    makes it a cloud, and where a detail is looked at."""
+
+    name: str
+    scene: jvr.Scene
+    camera: Any
+    settings: jvr.Settings
+    surface: float
+    cloud: float
+    detail: Sequence[float]
+
+    @property
+    def table(self) -> jvr.LutTransfer:
+        assert isinstance(self.scene.transfer, jvr.LutTransfer)
+        return self.scene.transfer
+
+    def beside(self, sideways: float, upwards: float, back: float) -> np.ndarray:
+        """A place in the world, in radii of the volume from its middle: to the right, upwards in the picture, and towards the eye."""
+        axes = np.asarray(self.camera.world_from_camera)[:3, :3]
+        offset = axes @ np.array([sideways, upwards, back])
+        return np.asarray(self.scene.volume.center) + float(self.scene.volume.radius) * offset
+
+
+def subjects(size: int) -> list[Subject]:
+    """The head where it is there, and the embedded volume."""
+    found = []
+    if (DATA / HEAD).exists():
+        found.append(_subject("CT of a head", "real/ct_head_lit.toml", size, surface=150.0, cloud=0.1, detail=(60.0, 40.0, 60.0)))
+    else:
+        print(f"{HEAD} is not in $JVR_DATA: the sheet shows the embedded volume alone", file=sys.stderr)
+    found.append(_subject("embedded volume", "lit.toml", size, surface=0.04, cloud=0.06, detail=(0.0, -4.0, 12.0)))
+    return found
+
+
+def _subject(name: str, config: str, size: int, **numbers: Any) -> Subject:
+    read = read_config(CONFIGS / config, [f"camera.width={size}", f"camera.height={size}"])
+    scene = build_scene(read)
+    (camera,) = build_cameras(read, scene.volume)
+    return Subject(name, alike(scene), camera, build_settings(read), **numbers)
+
+
+def alike(scene: jvr.Scene) -> jvr.Scene:
+    """The scene with as many voxels, entries and lights as every other, so that an effect is compiled once for all subjects."""
+    old = scene.volume
+    grid = np.meshgrid(*[np.linspace(0, m - 1, n) for m, n in zip(old.shape, SHAPE, strict=True)], indexing="ij")
+    values = jax.jit(jax.vmap(old.sample))(tuple(jnp.asarray(x.ravel(), float) for x in grid))
+    scale = np.diag([*((m - 1) / (n - 1) for m, n in zip(old.shape, SHAPE, strict=True)), 1.0])
+    volume = jvr.Volume(np.asarray(values).reshape(SHAPE), np.asarray(old.world_from_grid) @ scale)
+    key, *_ = scene.lights
+    box = scene.clipping or jvr.ClippingBox([-1e3] * 3, [1e3] * 3)
+    lights = (key, jvr.HeadLight(0.15), jvr.AmbientLight(0.5))
+    shading = jvr.BlinnPhong(0.15, 0.85, 0.4, 30.0)
+    parts = {"background": scene.background, "clipping": box, "lights": lights, "shading": shading}
+    return jvr.Scene(volume, _table(scene.transfer), normals=jvr.PrecomputedGradient(), **parts)
+
+
+def _table(transfer: Any) -> jvr.LutTransfer:
+    ends = transfer.positions[0], transfer.positions[-1]
+    at = jax.vmap(transfer.evaluate)(jnp.linspace(*ends, 256))
+    return jvr.LutTransfer(np.stack(at.rgb, axis=-1), np.asarray(at.sigma_t[0]), ends)
+
+
+def shaded(of: Subject) -> dict[str, jvr.Scene]:
+    """Shading, and transfer functions that look at the gradient; nothing casts shadows."""
+    change = lambda **parts: dataclasses.replace(of.scene, **parts)
+    by_gradient = jvr.GradientOpacity(of.scene.transfer, 0.25 * of.surface, of.surface)
+    return {
+        "unlit": change(shading=None, lights=()),
+        "Lambert": change(shading=jvr.Lambert(0.15, 0.85)),
+        "Phong": change(shading=jvr.Phong(0.15, 0.85, 0.4, 10.0)),
+        "Blinn-Phong": of.scene,
+        "gradient-opacity": change(transfer=by_gradient),
+        "2-D transfer function": change(transfer=two_dimensional(of)),
+    }
+
+
+def two_dimensional(of: Subject) -> jvr.GradientTransfer:
+    """The same materials where the gradient is weak, fainter, and boundaries in one colour where it is strong."""
+    table = of.table
+    share = np.linspace(0, 1, 5)
+    colours = (1 - share[None, :, None]) * np.asarray(table.rgb)[:, None] + share[None, :, None] * np.array([0.15, 0.55, 0.75])
+    sigma_t = np.asarray(table.sigma_t)[:, None] * (0.1 + 0.9 * share)
+    return jvr.GradientTransfer(colours, sigma_t, table.domain, (0.0, of.surface))
+
+
+def normals(of: Subject) -> dict[str, jvr.Scene]:
+    """A detail by each estimate of the gradient."""
+    kinds = {
+        "analytic gradient": jvr.AnalyticGradient(),
+        "forward differences": jvr.ForwardDifferences(),
+        "central differences": jvr.CentralDifferences(),
+        "Sobel": jvr.SobelDifferences(),
+        "precomputed": jvr.PrecomputedGradient(),
+        "precomputed, of opacity": jvr.PrecomputedGradient(of_opacity=True),
+    }
+    return {f"normals: {name}": dataclasses.replace(of.scene, normals=kind) for name, kind in kinds.items()}
+
+
+def shadowed(of: Subject) -> dict[str, jvr.Scene]:
+    """Each method for shadows, and none."""
+    methods = {
+        "no shadows": None,
+        "shadow rays": jvr.ShadowRays(2.0),
+        "shadow volume": jvr.ShadowVolume(1.0),
+        "shadow map": jvr.ShadowMap(),
+        "opacity shadow map": jvr.OpacityShadowMap(),
+        "deep shadow map": jvr.DeepShadowMap(),
+    }
+    return {name: dataclasses.replace(of.scene, shadows=method) for name, method in methods.items()}
+
+
+def lit(of: Subject) -> dict[str, jvr.Scene]:
+    """Other lights, with a shadow volume where they cast shadows."""
+    center, radius = np.asarray(of.scene.volume.center), float(of.scene.volume.radius)
+    place, near = of.beside(-1.5, 1.5, 2.0), of.beside(-0.5, 0.6, 0.7)
+    # Irradiance 2 at the middle of the volume.
+    power = lambda place: 2.0 * float(np.sum(np.square(place - center)))
+    fill = jvr.AmbientLight(0.5)
+    key = jax.random.key(0)
+    lights = {
+        "soft shadow: sphere light": (*jvr.sphere_light(place, 0.5 * radius, power(place), key=key), fill),
+        "disc light": (*jvr.disc_light(place, center - place, 0.5 * radius, power(place), key=key), fill),
+        "point light, near": (jvr.PointLight(near, 0.6 * power(near)), fill),
+        "spot light": (jvr.SpotLight(place, center - place, power(place), inner=6.0, outer=9.0), fill),
+        "head light": (jvr.HeadLight(1.2), fill),
+        "ambient light": (jvr.AmbientLight(4.0),),
+    }
+    scenes = {}
+    for name, some in lights.items():
+        casts = any(not isinstance(light, jvr.HeadLight | jvr.AmbientLight) for light in some)
+        shadows = jvr.ShadowVolume(1.0) if casts else None
+        scenes[name] = dataclasses.replace(of.scene, lights=some, shadows=shadows)
+    return scenes
+
+
+def scattering(of: Subject) -> dict[str, jvr.Scene]:
+    """The volume as a cloud that scatters light from behind on the left, and the switch between surfaces and medium."""
+    table = of.table
+    thin, black = of.cloud * np.asarray(table.sigma_t), np.zeros_like(np.asarray(table.rgb))
+    cloud = jvr.LutTransfer(black, thin, table.domain)
+    coloured = jvr.LutTransfer(black, thin[:, None] * np.array([0.5, 1.0, 2.0]), table.domain)
+    travels = np.asarray(of.scene.volume.center) - of.beside(-1.0, 0.5, -0.6)
+    lights = (jvr.DirectionalLight(travels, 14.0),)
+    media = {
+        "scattering: isotropic": (cloud, jvr.Isotropic()),
+        "Henyey-Greenstein, g = 0.5": (cloud, jvr.HenyeyGreenstein(0.5)),
+        "Henyey-Greenstein, g = -0.5": (cloud, jvr.HenyeyGreenstein(-0.5)),
+        "Rayleigh": (cloud, jvr.Rayleigh()),
+        "coloured extinction": (coloured, jvr.Isotropic()),
+    }
+    change = lambda **parts: dataclasses.replace(of.scene, shadows=jvr.ShadowVolume(1.0), **parts)
+    scenes = {
+        name: change(transfer=transfer, lights=lights, shading=None, scattering=jvr.SingleScattering(phase, 0.95))
+        for name, (transfer, phase) in media.items()
+    }
+    switch = jvr.SingleScattering(jvr.Isotropic(), 1.0, threshold=0.3 * of.surface)
+    scenes["surfaces and medium"] = change(scattering=switch)
+    return scenes
+
+
+def detail_of(of: Subject) -> jvr.PerspectiveCamera:
+    """A narrow view of a part of the subject."""
+    pose = np.asarray(of.camera.world_from_camera)
+    fov_y = DETAIL * float(of.camera.fov_y)
+    return jvr.PerspectiveCamera.look_at(pose[:3, 3], of.detail, pose[:3, 1], fov_y, of.camera.width, of.camera.height)
+
+
+def pictures(subjects: list[Subject]) -> dict[str, list[tuple[str, np.ndarray, float]]]:
+    """Title, linear radiance and seconds of each picture of each subject."""
+    found: dict[str, list[tuple[str, np.ndarray, float]]] = {of.name: [] for of in subjects}
+    for group in (shaded, normals, shadowed, lit, scattering):
+        # One title after the other, so that all subjects use a program while it is there.
+        for scenes in zip(*(group(of).items() for of in subjects), strict=True):
+            for of, (title, scene) in zip(subjects, scenes, strict=True):
+                began = time.perf_counter()
+                camera = detail_of(of) if group is normals else of.camera
+                rgb = np.asarray(jvr.render(scene, camera, of.settings).rgb)
+                seconds = time.perf_counter() - began
+                found[of.name].append((title, rgb, seconds))
+                print(f"{of.name:<18}{title:<28}{seconds:>7.1f} s   mean {rgb.mean():.3f}   largest {rgb.max():.2f}", flush=True)
+    return found
+
+
+def sheet(found: dict[str, list[tuple[str, np.ndarray, float]]], path: str) -> None:
+    """All pictures in rows, a heading for each subject."""
+    from matplotlib.figure import Figure
+
+    rows = {name: -(-len(some) // COLUMNS) for name, some in found.items()}
+    drawing = Figure(figsize=(1.9 * COLUMNS, sum(2.1 * n + 0.3 for n in rows.values())), layout="constrained", facecolor="white")
+    heights = [2.1 * n + 0.3 for n in rows.values()]
+    parts = drawing.subfigures(len(found), 1, height_ratios=heights, squeeze=False).ravel()
+    for part, (name, some) in zip(parts, found.items(), strict=True):
+        part.suptitle(name, fontsize=11)
+        panels = part.subplots(rows[name], COLUMNS, squeeze=False).ravel()
+        for panel in panels:
+            panel.set_axis_off()
+        for panel, (title, rgb, _) in zip(panels, some, strict=False):
+            panel.imshow(srgb_from_linear(np.clip(rgb, 0, 1)))
+            panel.set_title(title, fontsize=8, pad=3)
+    drawing.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Renders all pictures, prints a line for each, and writes the sheet and JSON on request."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--figure", metavar="FILE", help="PNG of the sheet")
+    parser.add_argument("--json", metavar="FILE")
+    parser.add_argument("--quick", action="store_true", help="tiny pictures")
+    arguments = parser.parse_args()
+    size = 24 if arguments.quick else 192
+    found = pictures(subjects(size))
+    if arguments.json:
+        rows = [
+            {"subject": name, "picture": title, "seconds": seconds, "mean": float(rgb.mean()), "largest": float(rgb.max())}
+            for name, some in found.items()
+            for title, rgb, seconds in some
+        ]
+        Path(arguments.json).write_text(json.dumps({"size": size, "pictures": rows}, indent=2) + "\n")
+    if arguments.figure:
+        sheet(found, arguments.figure)
+
+
+if __name__ == "__main__":
+    main()

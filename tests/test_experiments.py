@@ -1,0 +1,112 @@
+"""Experiments of light: what they set up is what they say, and each runs from its command."""
+
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jvr
+from experiments import contact_sheet, phase_recovery, shadowed_fit
+from jvr.io.config import build_fit, build_scene, read_config
+
+
+@pytest.fixture
+def embedded(monkeypatch, tmp_path):
+    """No scans are found."""
+    for module in (contact_sheet, shadowed_fit):
+        monkeypatch.setattr(module, "DATA", tmp_path)
+
+
+def ran(module, monkeypatch, tmp_path):
+    """What the quick experiment writes: its JSON, and the size of its figure."""
+    numbers, picture = tmp_path / "numbers.json", tmp_path / "picture.png"
+    monkeypatch.setattr(sys, "argv", ["experiment", "--quick", "--json", str(numbers), "--figure", str(picture)])
+    module.main()
+    return json.loads(numbers.read_text()), picture.stat().st_size
+
+
+def test_the_contact_sheet_shows_every_effect_once(embedded):
+    (of,) = contact_sheet.subjects(8)
+    groups = [contact_sheet.shaded, contact_sheet.normals, contact_sheet.shadowed, contact_sheet.lit, contact_sheet.scattering]
+    scenes = {title: scene for group in groups for title, scene in group(of).items()}
+    assert len(scenes) == 5 * contact_sheet.COLUMNS
+    shown = {type(part) for s in scenes.values() for part in (s.shading, s.shadows, s.normals, s.transfer, *s.lights)}
+    shown |= {type(s.scattering.phase) for s in scenes.values() if s.scattering is not None}
+    wanted = "Lambert Phong BlinnPhong ShadowRays ShadowVolume ShadowMap OpacityShadowMap DeepShadowMap AnalyticGradient "
+    wanted += "ForwardDifferences CentralDifferences SobelDifferences PrecomputedGradient GradientOpacity GradientTransfer "
+    wanted += "DirectionalLight PointLight SpotLight HeadLight AmbientLight Isotropic HenyeyGreenstein Rayleigh"
+    assert {getattr(jvr, name) for name in wanted.split()} <= shown
+    assert any(s.scattering is not None and s.scattering.needs_gradient for s in scenes.values())
+
+
+def test_subjects_of_the_contact_sheet_look_as_their_configurations(embedded):
+    (of,) = contact_sheet.subjects(8)
+    given = build_scene(read_config(contact_sheet.CONFIGS / "lit.toml"))
+    old, new = (scene.volume.sample for scene in (given, of.scene))
+    x = jnp.asarray([[3.0, 10.0, -5.0], [-20.0, 1.0, 12.0]])
+    at = lambda scene, sample: jax.vmap(lambda x: sample(scene.volume.grid_from_world((x[0], x[1], x[2]))))(x)
+    # The volume is resampled: about the curvature of a voxel.
+    np.testing.assert_allclose(at(of.scene, new), at(given, old), atol=0.05)
+    for s in (0.2, 0.5, 0.8):
+        found, wanted = (scene.transfer.evaluate(jnp.asarray(s)) for scene in (of.scene, given))
+        np.testing.assert_allclose(found.sigma_t, wanted.sigma_t, atol=0.02)
+        np.testing.assert_allclose(found.rgb, wanted.rgb, atol=0.02)
+
+
+def test_a_light_turns_about_the_vertical():
+    scene = build_scene(read_config(phase_recovery.CONFIG))
+    x, y, z = np.asarray(scene.lights[0].direction)
+    np.testing.assert_allclose(phase_recovery.turned(scene, 90.0).lights[0].direction, [-y, x, z], atol=1e-6)
+
+
+def test_true_values_are_those_of_the_configuration():
+    config = read_config(phase_recovery.CONFIG, phase_recovery.LOBES)
+    np.testing.assert_allclose(phase_recovery.true_values(config), [0.7, -0.4, 0.75, 0.8])
+    directed = phase_recovery.true_values(read_config(phase_recovery.CONFIG, phase_recovery.DIRECTION))
+    np.testing.assert_allclose(directed[2:], np.array([0.8, 0.6, -0.4]) / np.sqrt(1.16), rtol=1e-6)
+
+
+def test_errors_of_a_table_are_relative_to_the_true_one():
+    truth = jvr.LutTransfer(np.full((4, 3), 0.5), [0.0, 1.0, 2.0, 2.0], (0.0, 1.0))
+    wrong = jvr.LutTransfer(np.full((4, 3), 0.6), [0.3, 1.0, 2.0, 2.0], (0.0, 1.0))
+    assert shadowed_fit.table_errors(truth, truth) == {"extinction": 0, "largest_extinction": 0, "colour": 0}
+    found = shadowed_fit.table_errors(wrong, truth)
+    assert found == pytest.approx({"extinction": 0.1, "largest_extinction": 0.15, "colour": 0.1}, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["shadowed_fit.toml", pytest.param("real/shadowed_fit.toml", marks=pytest.mark.slow)])
+def test_configurations_of_the_shadowed_fit_describe_the_same_experiment(name, request):
+    if name.startswith("real"):
+        request.getfixturevalue("data")
+    job = build_fit(read_config(shadowed_fit.CONFIGS / name, ["camera.width=4", "camera.height=4", "settings.step=8.0"]))
+    assert isinstance(job.scene.shadows, jvr.ShadowVolume)
+    assert job.scene.transfer.sigma_t.shape == job.truth.sigma_t.shape == (16,)
+    assert job.held_out is not None
+
+
+@pytest.mark.slow
+def test_the_contact_sheet_runs(embedded, monkeypatch, tmp_path):
+    result, size = ran(contact_sheet, monkeypatch, tmp_path)
+    assert size > 10_000
+    assert all(np.isfinite(row["largest"]) and row["mean"] > 0.005 for row in result["pictures"])
+
+
+@pytest.mark.slow
+def test_the_recovery_of_phase_functions_runs(monkeypatch, tmp_path):
+    result, size = ran(phase_recovery, monkeypatch, tmp_path)
+    assert size > 10_000
+    determined = [row for row in result["table"] if not row["run"].startswith("albedo and irradiance")]
+    # Three standard errors for each of thirteen numbers, with fixed noise.
+    assert all(row["errors_from_truth"] < 3 for row in determined)
+    assert all(row["standard_error"] is None for row in result["table"] if row not in determined)
+
+
+@pytest.mark.slow
+def test_the_fit_with_and_without_shadows_runs(embedded, monkeypatch, tmp_path):
+    result, size = ran(shadowed_fit, monkeypatch, tmp_path)
+    assert size > 10_000
+    scores = {row["model"]: row for row in result["table"]}
+    assert scores["with shadows"]["fitted_psnr"] > scores["without shadows"]["fitted_psnr"]
