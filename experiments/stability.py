@@ -92,7 +92,7 @@ def base(
         transfer,
         background=(0.2, 0.5, 0.9),
         lights=lights,
-        shading=jvr.BlinnPhong(0.1, 0.5, 0.3, shininess, threshold=threshold * slope),
+        shading=jvr.BlinnPhong(0.1, 0.5, 0.3, shininess, threshold=threshold * slope),  # pyright: ignore[reportCallIssue]
         shadows=shadows,
         scattering=jvr.SingleScattering(jvr.HenyeyGreenstein(g), albedo),
     )
