@@ -62,6 +62,20 @@ def _one_minus_exp_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[A
     return one_minus_exp(tau), jnp.exp(-tau) * tangent
 
 
+def mean_depth(tau: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Where the emission that leaves a homogeneous segment of optical depth `tau` comes from on average, as a share of its length:
+    `1 / tau - 1 / (exp(tau) - 1)`, from 1/2 for a thin segment towards 0 for an opaque one.
+
+    For thin ones by its series, `1/2 - tau/12 + tau^3/720 - tau^5/30240`, whose terms do not cancel; behind large ones `exp` overflows.
+    """
+    thin = tau < 0.5
+    small, large = jnp.where(thin, tau, 0.0), jnp.where(thin, 1.0, tau)
+    square = jnp.square(small)
+    series = 0.5 - small * (1 / 12 - square * (1 / 720 - square / 30240))
+    decay = jnp.exp(-large)
+    return jnp.where(thin, series, 1 / large - decay / (1 - decay))
+
+
 def normalise(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Unit vector; zero stays zero, with derivative zero. Scaled first, so that squares neither overflow nor underflow."""
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1, keepdims=True))

@@ -494,3 +494,18 @@ def test_pre_integrated_segments_converge_to_the_same_lit_picture(x64):
 def test_what_cannot_be_right_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize(("sigma", "least"), [(0.5, 0.989), (1.0, 0.962), (4.0, 0.778), (1e4, 0.734)])
+def test_opaque_segments_are_lit_where_their_emission_comes_from(sigma, least):
+    """A slab lit and seen from the front, `(1 - exp(-2 tau)) / (8 pi)` per irradiance, by segments of optical depth `sigma`: light at
+    their middle would tend to 0, at the mean depth of what leaves them it tends to `2 / e` of the truth."""
+    volume = jvr.Volume(np.ones((4, 4, 8), np.float32))
+    camera = jvr.OrthographicCamera.look_at((1.5, 1.5, 30.0), (1.5, 1.5, 0.0), (0, 1, 0), 1.0, 2, 2)
+    table = jvr.LinearTransfer([0.0, 2.0], np.zeros((2, 3)), [sigma, sigma])
+    light = jvr.DirectionalLight((0.0, 0.0, -1.0))
+    scene = jvr.Scene(volume, table, lights=(light,), scattering=jvr.SingleScattering(), shadows=jvr.ShadowRays(termination=0))
+    radiance = np.asarray(render(scene, camera, jvr.Settings(1.0)).rgb)
+    truth = -np.expm1(-14 * sigma) / (8 * np.pi)
+    assert np.all(radiance >= least * truth)
+    assert np.all(radiance <= truth * (1 + 1e-5))

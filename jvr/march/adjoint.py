@@ -29,6 +29,7 @@ from jvr.march.march import (
     MarchOptions,
     Medium,
     Noted,
+    Stretch,
     for_derivatives,
     integrate,
     lanes_of,
@@ -208,7 +209,10 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marc
         extent, u = segment(k, count, rays.length, dt)
         sampled = places(medium, rays, lanes.ray, k, u, extent)
         samples = jax.tree.map(jnp.add, resample(medium, sampled, k < count), taps)
-        samples = lit(medium._replace(shadows=shadows), sampled, samples, k < count, reverse=True)
+        where = Stretch(rays, lanes.ray, k, u, extent, k < count)
+        # Light moves with the extinction, of which it knows as the shader does.
+        moved = medium._replace(transfer=transfer, shader=shader, shadows=shadows)
+        samples = lit(moved, where, samples, reverse=True)
         point = points_at(rays, lanes.ray, k, u)
         looks = jax.vmap(shader.look, in_axes=(None, 0, 0, 0))(transfer, samples, point, extent)
         return (*computed_once(k < count, looks), u), sampled

@@ -19,7 +19,7 @@ from jvr.march.batch import pooled_while
 from jvr.march.occupancy import Occupancy
 from jvr.march.steps import Point, Rays, Sample, points_at, segment, segment_count
 from jvr.model.transfer import Classified
-from jvr.numerics import computed_once, one_minus_exp, two_sum
+from jvr.numerics import computed_once, mean_depth, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
 # Leaps before a ray is started.
@@ -138,6 +138,17 @@ class Lanes(NamedTuple):
     rays: Rays
     ray: Int[Array, "rays"]
     segments: Int[Array, "rays"]
+
+
+class Stretch(NamedTuple):
+    """One segment of every ray: its index, the distance of its middle from the entry, its length, and whether it is there."""
+
+    rays: Rays
+    ray: Int[Array, "rays"]
+    k: Int[Array, "..."]
+    u: Float[Array, "rays"]
+    extent: Float[Array, "rays"]
+    inside: Bool[Array, "rays"]
 
 
 class Progress(NamedTuple):
@@ -265,7 +276,8 @@ def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"]
     """Emission and optical depth of segment `k` of every ray, and the distance of its midpoint; zero beyond `count`."""
     extent, u = segment(k, count, lanes.rays.length, dt)
     sampled = places(medium, lanes.rays, lanes.ray, k, u, extent)
-    samples = lit(medium, sampled, resample(medium, sampled, k < count), k < count, reverse=False)
+    where = Stretch(lanes.rays, lanes.ray, k, u, extent, k < count)
+    samples = lit(medium, where, resample(medium, sampled, k < count), reverse=False)
     point = points_at(lanes.rays, lanes.ray, k, u)
     emitted, dtau = jax.vmap(medium.shader.look, in_axes=(None, 0, 0, 0))(medium.transfer, samples, point, extent)
     return emitted, dtau, u
@@ -276,28 +288,26 @@ def resample(medium: Medium, sampled: list[Point], proof: Bool[Array, "rays"]) -
     return computed_once(proof, tuple(jax.vmap(medium.field.resample)(points) for points in sampled))
 
 
-def lit(
-    medium: Medium, sampled: list[Point], samples: tuple[Sample, ...], inside: Bool[Array, "rays"], *, reverse: bool
-) -> tuple[Sample, ...]:
-    """The samples with the light that reaches them, where that is asked for and they are `inside`."""
+def lit(medium: Medium, where: Stretch, samples: tuple[Sample, ...], *, reverse: bool) -> tuple[Sample, ...]:
+    """The samples of a segment with the light that reaches it, where that is asked for.
+
+    Light is looked up where the segment's own emission comes from on average, in front of its middle: in the middle of an opaque one it
+    is dark, though its front is not.
+    """
     shadows = medium.shadows
     if shadows is None:
         return samples
-    found = []
-    for points, sample in zip(sampled, samples, strict=True):
-        # Where nothing is left out everything has a derivative, and between the ends of a segment there may be what is at neither.
-        everywhere = medium.occupancy is None or len(sampled) > 1
-        wanted = inside if everywhere else inside & has_extinction(medium, sample, points)
-        light = shadows.transmittances(points, wanted, reverse=reverse)
-        found.append(sample._replace(light=computed_once(inside, light)))
-    return tuple(found)
-
-
-def has_extinction(medium: Medium, samples: Sample, points: Point) -> Bool[Array, "rays"]:
-    """Whether anything is to be seen at each of a batch of samples."""
-    shader = medium.shader
+    shader, middle = medium.shader, points_at(where.rays, where.ray, where.k, where.u)
     classify = lambda sample, point: shader.classify(medium.transfer, shader.prepare(medium.transfer, sample, point)).sigma_t
-    return functools.reduce(jnp.logical_or, [sigma != 0 for sigma in jax.vmap(classify)(samples, points)])
+    sigma_t = [sigma for sample in samples for sigma in jax.vmap(classify)(sample, middle)]
+    dtau = sum(sigma_t[1:], sigma_t[0]) / len(sigma_t) * where.extent
+    points = points_at(where.rays, where.ray, where.k, where.u + where.extent * (mean_depth(dtau) - 0.5))
+    # Without extinction there is nothing to see; but where nothing is left out it has a derivative, and between the ends of a segment
+    # there may be what is at neither.
+    everywhere = medium.occupancy is None or len(samples) > 1
+    wanted = where.inside if everywhere else where.inside & functools.reduce(jnp.logical_or, [sigma != 0 for sigma in sigma_t])
+    light = computed_once(where.inside, shadows.transmittances(points, wanted, reverse=reverse))
+    return tuple(sample._replace(light=light) for sample in samples)
 
 
 def places(
