@@ -126,7 +126,7 @@ def figure(results: list[dict[str, Any]], path: str) -> None:
         panel.xaxis.set_major_formatter("{x:g}")
         panel.xaxis.set_minor_formatter(NullFormatter())
     most = max(panels, key=lambda panel: len(panel.get_legend_handles_labels()[0]))
-    drawing.legend(*most.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    drawing.legend(*most.get_legend_handles_labels(), loc="outside lower center", ncols=1 + len(results), frameon=False)
     drawing.savefig(path, dpi=130)
 
 
