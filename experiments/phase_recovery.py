@@ -221,7 +221,7 @@ def figure(one: Found, lobes: Found, truths: Sequence[np.ndarray], views: View, 
     white = float(np.percentile(np.asarray(views.image), 99.8))
     for panel, image, turn in zip(above.subplots(1, len(views.turn)), views.image, views.turn, strict=True):
         panel.imshow(srgb_from_linear(np.clip(np.asarray(image) / white, 0, 1)))
-        panel.set_title(f"light turned by {float(turn):g}°", fontsize=8)
+        panel.set_title(f"light turned by {float(turn) % 360:g}°", fontsize=8)
         panel.set_axis_off()
     panels = below.subplots(1, 3)
     for panel, found, truth, title in zip(panels, (one, lobes), truths, ("one lobe", "two lobes"), strict=False):
@@ -229,9 +229,10 @@ def figure(one: Found, lobes: Found, truths: Sequence[np.ndarray], views: View, 
             panel.plot(found.path[:, i], "o-", markersize=3, color=f"C{i}", label=name)
             panel.axhline(truth[i], color=f"C{i}", linestyle=":", linewidth=1)
         panel.set(title=f"{title} (dotted: truth)", xlabel="step of Levenberg-Marquardt")
+        panel.xaxis.get_major_locator().set_params(integer=True)
         panel.legend(fontsize=8, frameon=False)
     degrees = np.linspace(0, 180, 181)
-    for values, style, label in ((truths[1], "k:", "truth"), (lobes.path[0], "C7--", "start"), (lobes.path[-1], "C0-", "found")):
+    for values, style, label in ((lobes.path[0], "C7--", "start"), (lobes.path[-1], "C0-", "found"), (truths[1], "k:", "truth")):
         panels[2].plot(degrees, _lobes(values, degrees), style, label=label)
     panels[2].set(title="phase function of two lobes", xlabel="scattering angle, degrees", yscale="log")
     panels[2].legend(fontsize=8, frameon=False)
