@@ -2,17 +2,16 @@
 
 `python experiments/contact_sheet.py [-o FILE] [--json FILE] [--quick]`; `--figure` is another name of `-o`. Both scenes come from
 configurations (`configs/real/ct_head_lit.toml`, `configs/lit.toml`), and each picture changes the one thing that its title names; JSON
-holds its seconds (compilation included) and its mean and largest radiance.
+holds its mean and largest radiance and, for shadows, the error against shadow rays.
 """
 
 import argparse
 import dataclasses
 import json
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -21,14 +20,26 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jvr
+from experiments.accuracy_vs_time import machine
 from experiments.protocols import DATA, HEAD
 from jvr.io.config import build_cameras, build_scene, build_settings, read_config
 from jvr.io.images import srgb_from_linear
+from jvr.parallel import in_threads
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 COLUMNS = 6
 # Voxels of every volume.
 SHAPE = (64, 64, 93)
+# By subject and title.
+Pictures: TypeAlias = dict[str, dict[str, np.ndarray]]
+
+METHODS = {
+    "shadow rays": jvr.ShadowRays(2.0),
+    "shadow volume": jvr.ShadowVolume(),
+    "shadow map": jvr.ShadowMap(),
+    "opacity shadow map": jvr.OpacityShadowMap(),
+    "deep shadow map": jvr.DeepShadowMap(),
+}
 # What share of a picture a detail shows.
 DETAIL = 0.3
 
@@ -83,10 +94,10 @@ def alike(scene: jvr.Scene) -> jvr.Scene:
     values = jax.jit(jax.vmap(old.sample))(tuple(jnp.asarray(x.ravel(), float) for x in grid))
     scale = np.diag([*((m - 1) / (n - 1) for m, n in zip(old.shape, SHAPE, strict=True)), 1.0])
     volume = jvr.Volume(np.asarray(values).reshape(SHAPE), np.asarray(old.world_from_grid) @ scale)
-    key, *_ = scene.lights
+    key, threshold = cast(Any, scene.lights[0]), cast(Any, scene.shading).threshold
     box = scene.clipping or jvr.ClippingBox([-1e3] * 3, [1e3] * 3)
-    lights = (key, jvr.HeadLight(0.15), jvr.AmbientLight(0.5))
-    shading = jvr.BlinnPhong(0.15, 0.85, 0.4, 30.0)
+    lights = (dataclasses.replace(key, irradiance=0.65 * key.irradiance), jvr.HeadLight(0.15), jvr.AmbientLight(0.6))
+    shading = jvr.BlinnPhong(0.15, 0.85, 0.4, 30.0, threshold=threshold)
     parts = {"background": scene.background, "clipping": box, "lights": lights, "shading": shading}
     return jvr.Scene(volume, _table(scene.transfer), normals=jvr.PrecomputedGradient(), **parts)
 
@@ -100,11 +111,12 @@ def _table(transfer: Any) -> jvr.LutTransfer:
 def shaded(of: Subject) -> dict[str, jvr.Scene]:
     """Shading, and transfer functions that look at the gradient; nothing casts shadows."""
     change = lambda **parts: dataclasses.replace(of.scene, **parts)
+    surface = {"threshold": cast(Any, of.scene.shading).threshold}
     by_gradient = jvr.GradientOpacity(of.scene.transfer, 0.25 * of.surface, of.surface)
     return {
         "unlit": change(shading=None, lights=()),
-        "Lambert": change(shading=jvr.Lambert(0.15, 0.85)),
-        "Phong": change(shading=jvr.Phong(0.15, 0.85, 0.4, 10.0)),
+        "Lambert": change(shading=jvr.Lambert(0.15, 0.85, **surface)),
+        "Phong": change(shading=jvr.Phong(0.15, 0.85, 0.4, 10.0, **surface)),
         "Blinn-Phong": of.scene,
         "gradient-opacity": change(transfer=by_gradient),
         "2-D transfer function": change(transfer=two_dimensional(of)),
@@ -135,31 +147,24 @@ def normals(of: Subject) -> dict[str, jvr.Scene]:
 
 def shadowed(of: Subject) -> dict[str, jvr.Scene]:
     """Each method for shadows, and none."""
-    methods = {
-        "no shadows": None,
-        "shadow rays": jvr.ShadowRays(2.0),
-        "shadow volume": jvr.ShadowVolume(1.0),
-        "shadow map": jvr.ShadowMap(),
-        "opacity shadow map": jvr.OpacityShadowMap(),
-        "deep shadow map": jvr.DeepShadowMap(),
-    }
-    return {name: dataclasses.replace(of.scene, shadows=method) for name, method in methods.items()}
+    return {name: dataclasses.replace(of.scene, shadows=method) for name, method in {"no shadows": None, **METHODS}.items()}
 
 
 def lit(of: Subject) -> dict[str, jvr.Scene]:
     """Other lights, with a shadow volume where they cast shadows."""
     center, radius = np.asarray(of.scene.volume.center), float(of.scene.volume.radius)
     place, near = of.beside(-1.5, 1.5, 2.0), of.beside(-0.5, 0.6, 0.7)
-    # Irradiance 2 at the middle of the volume.
-    power = lambda place: 2.0 * float(np.sum(np.square(place - center)))
+    # Irradiance 1.5 at the middle of the volume.
+    power = lambda place: 1.5 * float(np.sum(np.square(place - center)))
     fill = jvr.AmbientLight(0.5)
-    key = jax.random.key(0)
+    # Every point of a luminous ball adds to what is compiled.
+    points: Any = {"key": jax.random.key(0), "samples": 8}
     lights = {
-        "soft shadow: sphere light": (*jvr.sphere_light(place, 0.5 * radius, power(place), key=key), fill),
-        "disc light": (*jvr.disc_light(place, center - place, 0.5 * radius, power(place), key=key), fill),
+        "soft shadow: sphere light": (*jvr.sphere_light(place, 0.5 * radius, power(place), **points), fill),
+        "disc light": (*jvr.disc_light(place, center - place, 0.5 * radius, power(place), **points), fill),
         "point light, near": (jvr.PointLight(near, 0.6 * power(near)), fill),
-        "spot light": (jvr.SpotLight(place, center - place, power(place), inner=6.0, outer=9.0), fill),
-        "head light": (jvr.HeadLight(1.2), fill),
+        "spot light": (jvr.SpotLight(place, center - place, power(place), inner=3.0, outer=8.0), fill),
+        "head light": (jvr.HeadLight(0.8), fill),
         "ambient light": (jvr.AmbientLight(4.0),),
     }
     scenes = {}
@@ -202,23 +207,42 @@ def detail_of(of: Subject) -> jvr.PerspectiveCamera:
     return jvr.PerspectiveCamera.look_at(pose[:3, 3], of.detail, pose[:3, 1], fov_y, of.camera.width, of.camera.height)
 
 
-def pictures(subjects: list[Subject]) -> dict[str, list[tuple[str, np.ndarray, float]]]:
-    """Title, linear radiance and seconds of each picture of each subject."""
-    found: dict[str, list[tuple[str, np.ndarray, float]]] = {of.name: [] for of in subjects}
+def pictures(subjects: list[Subject]) -> Pictures:
+    """The linear radiance of all pictures."""
+    titles: list[tuple[str, list[tuple[Subject, jvr.Scene, Any]]]] = []
     for group in (shaded, normals, shadowed, lit, scattering):
-        # One title after the other, so that all subjects use a program while it is there.
-        for scenes in zip(*(group(of).items() for of in subjects), strict=True):
-            for of, (title, scene) in zip(subjects, scenes, strict=True):
-                began = time.perf_counter()
-                camera = detail_of(of) if group is normals else of.camera
-                rgb = np.asarray(jvr.render(scene, camera, of.settings).rgb)
-                seconds = time.perf_counter() - began
-                found[of.name].append((title, rgb, seconds))
-                print(f"{of.name:<18}{title:<28}{seconds:>7.1f} s   mean {rgb.mean():.3f}   largest {rgb.max():.2f}", flush=True)
-    return found
+        of_group = {of.name: group(of) for of in subjects}
+        camera = detail_of if group is normals else lambda of: of.camera
+        for title in of_group[subjects[0].name]:
+            titles.append((title, [(of, of_group[of.name][title], camera(of)) for of in subjects]))
+
+    def one_title(of_title: tuple[str, list[tuple[Subject, jvr.Scene, Any]]]) -> list[np.ndarray]:
+        # All subjects use the program that the first one compiles, which takes most of the time.
+        title, scenes = of_title
+        found = [np.asarray(jvr.render(scene, camera, of.settings).rgb) for of, scene, camera in scenes]
+        for (of, _, _), rgb in zip(scenes, found, strict=True):
+            print(f"{of.name:<18}{title:<28}mean {rgb.mean():.3f}   largest {rgb.max():.2f}", flush=True)
+        return found
+
+    found = in_threads(one_title, titles)
+    names = [title for title, _ in titles]
+    return {of.name: dict(zip(names, [some[i] for some in found], strict=True)) for i, of in enumerate(subjects)}
 
 
-def sheet(found: dict[str, list[tuple[str, np.ndarray, float]]], path: str) -> None:
+def rows(found: Pictures) -> list[dict[str, Any]]:
+    """A line for each picture; those with shadows say how far they are from that of shadow rays."""
+    lines = []
+    for name, some in found.items():
+        for title, rgb in some.items():
+            error = None
+            if title in METHODS or title == "no shadows":
+                error = float(np.sqrt(np.mean(np.square(rgb - some["shadow rays"]))))
+            line = {"subject": name, "picture": title, "mean": float(rgb.mean()), "largest": float(rgb.max())}
+            lines.append({**line, "rmse_of_shadow_rays": error})
+    return lines
+
+
+def sheet(found: Pictures, path: str) -> None:
     """All pictures in rows, a heading for each subject."""
     from matplotlib.figure import Figure
 
@@ -231,10 +255,10 @@ def sheet(found: dict[str, list[tuple[str, np.ndarray, float]]], path: str) -> N
         panels = part.subplots(rows[name], COLUMNS, squeeze=False).ravel()
         for panel in panels:
             panel.set_axis_off()
-        for panel, (title, rgb, _) in zip(panels, some, strict=False):
+        for panel, (title, rgb) in zip(panels, some.items(), strict=False):
             panel.imshow(srgb_from_linear(np.clip(rgb, 0, 1)))
             panel.set_title(title, fontsize=8, pad=3)
-    drawing.savefig(path, dpi=110)
+    drawing.savefig(path, dpi=92, pil_kwargs={"optimize": True})
 
 
 def main() -> None:
@@ -244,15 +268,12 @@ def main() -> None:
     parser.add_argument("--json", metavar="FILE")
     parser.add_argument("--quick", action="store_true", help="tiny pictures")
     arguments = parser.parse_args()
-    size = 24 if arguments.quick else 192
+    size = 24 if arguments.quick else 160
     found = pictures(subjects(size))
     if arguments.json:
-        rows = [
-            {"subject": name, "picture": title, "seconds": seconds, "mean": float(rgb.mean()), "largest": float(rgb.max())}
-            for name, some in found.items()
-            for title, rgb, seconds in some
-        ]
-        Path(arguments.json).write_text(json.dumps({"size": size, "pictures": rows}, indent=2) + "\n")
+        Path(arguments.json).write_text(
+            json.dumps({"machine": machine(), "size": size, "pictures": rows(found)}, indent=2) + "\n"
+        )
     if arguments.figure:
         sheet(found, arguments.figure)
 

@@ -5,8 +5,9 @@
 `jvr.fit` explains all pictures by one scene. Here every view has a scene of its own, the same but for the direction of its light, so the
 residuals of all views are stacked as a function of what the scenes share, and Optimistix's Levenberg-Marquardt makes them small:
 `jvr.Settings(adjoint=jvr.Forward())` is what it needs to differentiate `jvr.render`. Standard errors come from the Jacobian at the end, by
-the same rule as those of `jvr.fit`. Beside it `jvr.fit` itself, with the light at rest, finds the direction of the light as well. Both are
-also asked for albedo and irradiance together, of which pictures determine the product alone.
+the same rule as those of `jvr.fit`. Beside it `jvr.fit` itself, with the light at rest, finds the direction of the light as well. Two
+questions have no answer, and are reported so: albedo and irradiance, of which pictures determine the product alone, and asymmetry and
+albedo under a light at the eye, which shows one scattering angle.
 """
 
 import argparse
@@ -51,6 +52,8 @@ BOTH = (
     "fit.initial.scattering={albedo=0.7, phase={kind='henyey-greenstein', g=0.55}}",
     'fit.unknowns=["scattering.albedo", "lights.0.irradiance"]',
 )
+# A light at the eye, which shows one scattering angle; shadows ask for another light.
+HEAD = ('lights=[{kind="head", irradiance=12.0}, {kind="directional", direction=[0, 0, -1], irradiance=0.0}]',)
 
 
 class View(NamedTuple):
@@ -80,12 +83,13 @@ class Residuals(eqx.Module):
 
 
 class Found(NamedTuple):
-    """What a run ends with: names, values at each step (the start first), standard errors, seconds, and how many combinations of
-    unknowns the pictures determine."""
+    """What a run ends with: names, values from start to end (at each step where there is a way to see them), standard errors, number of
+    steps, seconds, and how many combinations of unknowns the pictures determine."""
 
     names: list[str]
     path: np.ndarray
     errors: np.ndarray
+    steps: int
     seconds: float
     rank: int
 
@@ -124,7 +128,7 @@ def under_moving_light(config: Config, steps: int = 30) -> tuple[Found, View]:
     r = np.asarray(residuals_at(residuals, jnp.asarray(values[-1])), np.float64)
     known = determination(jacobian.T @ jacobian, float(r @ r), r.size)
     seconds = time.perf_counter() - began
-    return Found(_labels(chosen, start), np.stack(values), known.standard_errors, seconds, known.rank), views
+    return Found(_labels(chosen, start), np.stack(values), known.standard_errors, len(path) - 1, seconds, known.rank), views
 
 
 def minimised(residuals: Residuals, real: Float[Array, "unknowns"], steps: int) -> list[Array]:
@@ -164,7 +168,8 @@ def light_at_rest(config: Config) -> Found:
     chosen = choose_unknowns(Exposed(job.scene, None), lambda m: job.keywords["unknowns"](m.scene))
     values = [np.concatenate([np.ravel(a) for a in job.keywords["unknowns"](s)]) for s in (job.scene, result.scene)]
     errors = np.concatenate([np.ravel(e) for e in result.errors_by_name.values()])
-    return Found(_labels(chosen, Exposed(job.scene, None)), np.stack(values), errors, result.stats.seconds, result.stats.rank)
+    names, stats = _labels(chosen, Exposed(job.scene, None)), result.stats
+    return Found(names, np.stack(values), errors, len(result.history), stats.seconds, stats.rank)
 
 
 def _labels(chosen: Unknowns, model: Exposed) -> list[str]:
@@ -180,7 +185,8 @@ def true_values(config: Config) -> np.ndarray:
     """What the unknowns are where the pictures come from; directions with length 1, as fits return them."""
     select, scene = build_fit(config).keywords["unknowns"], build_scene(config)
     light = cast(Any, scene.lights[0])
-    scene = eqx.tree_at(lambda s: s.lights[0].direction, scene, light.direction / jnp.linalg.norm(light.direction))
+    if isinstance(light, jvr.DirectionalLight):
+        scene = eqx.tree_at(lambda s: s.lights[0].direction, scene, light.direction / jnp.linalg.norm(light.direction))
     return np.concatenate([np.ravel(a) for a in select(scene)])
 
 
@@ -196,9 +202,7 @@ def rows(run: str, found: Found, truth: np.ndarray) -> list[dict[str, Any]]:
 
 
 def show(lines: list[dict[str, Any]], found: Found) -> None:
-    print(
-        f"\n{lines[0]['run']}: {len(found.path) - 1} steps, {found.seconds:.0f} s, {found.rank} of {len(lines)} combinations known"
-    )
+    print(f"\n{lines[0]['run']}: {found.steps} steps, {found.seconds:.0f} s, {found.rank} of {len(lines)} combinations known")
     print(f"{'':<26}{'truth':>10}{'start':>10}{'found':>10}{'std. error':>12}{'away':>8}")
     for line in lines:
         error, away = line["standard_error"], line["errors_from_truth"]
@@ -217,7 +221,7 @@ def figure(one: Found, lobes: Found, truths: Sequence[np.ndarray], views: View, 
     white = float(np.percentile(np.asarray(views.image), 99.8))
     for panel, image, turn in zip(above.subplots(1, len(views.turn)), views.image, views.turn, strict=True):
         panel.imshow(srgb_from_linear(np.clip(np.asarray(image) / white, 0, 1)))
-        panel.set_title(f"light turned by {float(turn):g}°", fontsize=8)
+        panel.set_title(f"light turned by {float(turn) % 360:g}°", fontsize=8)
         panel.set_axis_off()
     panels = below.subplots(1, 3)
     for panel, found, truth, title in zip(panels, (one, lobes), truths, ("one lobe", "two lobes"), strict=False):
@@ -225,9 +229,10 @@ def figure(one: Found, lobes: Found, truths: Sequence[np.ndarray], views: View, 
             panel.plot(found.path[:, i], "o-", markersize=3, color=f"C{i}", label=name)
             panel.axhline(truth[i], color=f"C{i}", linestyle=":", linewidth=1)
         panel.set(title=f"{title} (dotted: truth)", xlabel="step of Levenberg-Marquardt")
+        panel.xaxis.get_major_locator().set_params(integer=True)
         panel.legend(fontsize=8, frameon=False)
     degrees = np.linspace(0, 180, 181)
-    for values, style, label in ((truths[1], "k:", "truth"), (lobes.path[0], "C7--", "start"), (lobes.path[-1], "C0-", "found")):
+    for values, style, label in ((lobes.path[0], "C7--", "start"), (lobes.path[-1], "C0-", "found"), (truths[1], "k:", "truth")):
         panels[2].plot(degrees, _lobes(values, degrees), style, label=label)
     panels[2].set(title="phase function of two lobes", xlabel="scattering angle, degrees", yscale="log")
     panels[2].legend(fontsize=8, frameon=False)
@@ -250,7 +255,7 @@ def main() -> None:
     arguments = parser.parse_args()
     small = ("camera.width=12", "camera.height=12", "settings.step=4.0") if arguments.quick else ()
     configs = {name: read_config(CONFIG, [*small, *sets]) for name, sets in
-               (("one lobe", ()), ("two lobes", LOBES), ("direction", DIRECTION), ("both", BOTH))}  # fmt: skip
+               (("one lobe", ()), ("two lobes", LOBES), ("direction", DIRECTION), ("both", BOTH), ("head", HEAD))}  # fmt: skip
     truths = {name: true_values(config) for name, config in configs.items()}
     one, views = under_moving_light(configs["one lobe"])
     lobes, _ = under_moving_light(configs["two lobes"])
@@ -260,6 +265,7 @@ def main() -> None:
         "albedo and irradiance, moving light": ("both", under_moving_light(configs["both"])[0]),
         "one lobe and direction, light at rest (jvr.fit)": ("direction", light_at_rest(configs["direction"])),
         "albedo and irradiance, light at rest (jvr.fit)": ("both", light_at_rest(configs["both"])),
+        "one lobe, light at the eye (jvr.fit)": ("head", light_at_rest(configs["head"])),
     }
     table = []
     for title, (name, found) in runs.items():

@@ -52,14 +52,15 @@ def table_errors(found: Any, truth: Any) -> dict[str, float]:
     }
 
 
-def compare(job: FitJob, truth: jvr.Scene) -> tuple[list[dict[str, Any]], dict[str, list[np.ndarray]], dict[str, Any]]:
-    """A row for each way to render what was fitted, the pictures (seen, held out, relit) and the transfer functions behind them."""
+def compare(job: FitJob, truth: jvr.Scene, size: int) -> tuple[list[dict[str, Any]], dict[str, list[np.ndarray]], dict[str, Any]]:
+    """A row for each way to render what was fitted, the pictures (seen, held out, relit; `size` pixels wide) and the transfer
+    functions behind them."""
     settings = job.keywords["settings"]
     assert job.held_out is not None
-    (front,), _ = job.held_out
+    seen, front = (dataclasses.replace(camera, width=size, height=size) for camera in (job.cameras[0], *job.held_out[0]))
     render = jax.jit(jvr.render)
     picture = lambda scene, camera: np.asarray(render(scene, camera, settings).rgb)
-    views = lambda scene: [picture(scene, job.cameras[0]), picture(scene, front), picture(relit(scene), front)]
+    views = lambda scene: [picture(scene, seen), picture(scene, front), picture(relit(scene), front)]
     fitted = {}
     for name, start in (("with shadows", job.scene), ("without shadows", dataclasses.replace(job.scene, shadows=None))):
         fitted[name] = jvr.fit(start, job.cameras, job.targets, **job.keywords)
@@ -107,8 +108,7 @@ def figure(pictures: dict[str, list[np.ndarray]], transfers: dict[str, Any], pat
         for panel, image, title in zip(row, some, ("fitted view", "held-out view", "relit"), strict=True):
             panel.imshow(srgb_from_linear(np.clip(image, 0, 1)))
             panel.set(xticks=[], yticks=[])
-            if row is panels[0]:
-                panel.set_title(title, fontsize=9)
+            panel.set_title(title if name == "truth" else "", fontsize=9)
         row[0].set_ylabel(name.replace(", ", ",\n"), fontsize=8)
     above, *below = right.subplots(4, 1, sharex=True, height_ratios=[2, 1, 1, 1])
     styles = {"truth": "k-", "with shadows": "C0o--", "without shadows": "C1s:"}
@@ -146,7 +146,7 @@ def main() -> None:
     )
     name = "real/shadowed_fit.toml" if on_head else "shadowed_fit.toml"
     config = read_config(CONFIGS / name, small if arguments.quick else ())
-    rows, pictures, transfers = compare(build_fit(config), build_scene(config))
+    rows, pictures, transfers = compare(build_fit(config), build_scene(config), 12 if arguments.quick else 160)
     show(rows)
     if arguments.json:
         result = {"machine": machine(), "config": f"configs/{name}", "table": rows}
