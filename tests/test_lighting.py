@@ -74,9 +74,8 @@ def test_slab_scatters_as_its_integral_says(g, x64):
         np.testing.assert_allclose(one(scene), p * np.array([0.8, 0.8, 0.5]) * scattered(direction), rtol=MIDPOINT)
 
 
-@pytest.mark.parametrize(
-    "quadrature", [jvr.Midpoint(), pytest.param(jvr.PreIntegrated(), marks=pytest.mark.slow)], ids=["midpoint", "pre-integrated"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("quadrature", [jvr.Midpoint(), jvr.PreIntegrated()], ids=["midpoint", "pre-integrated"])
 def test_error_of_a_lit_slab_falls_with_the_square_of_the_step(quadrature, x64):
     errors, steps = [], [0.4, 0.15, 0.05]
     scene = jvr.Scene(

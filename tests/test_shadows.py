@@ -65,9 +65,7 @@ REFINED = {
 }
 
 
-@pytest.mark.parametrize(
-    "method", [pytest.param(m, marks=pytest.mark.slow if m in ("rays", "opacity map") else []) for m in REFINED]
-)
+@pytest.mark.parametrize("method", [pytest.param(m, marks=[] if m == "deep map" else pytest.mark.slow) for m in REFINED])
 @pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=[] if n == "inside" else pytest.mark.slow) for n in LIGHTS],
@@ -78,7 +76,8 @@ def test_refined_shadows_converge_to_exact_rays(method, name, x64):
     assert error(name, None) > 0.1
     before, after = error(name, coarse), error(name, fine)
     assert after < left * before, (before, after)
-    assert after < 5e-3, after
+    # What a picture of 8 bits can hold, and a little.
+    assert after < 8e-3, after
 
 
 @pytest.mark.slow
@@ -125,9 +124,10 @@ def opaque_block(light, shadows, n=24):
     return np.asarray(render(scene, camera, SETTINGS).rgb)[..., 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "light",
-    [jvr.DirectionalLight([0.5, 0, -1]), pytest.param(jvr.PointLight([11.5, 11.5, 40.0], 800.0), marks=pytest.mark.slow)],
+    [jvr.DirectionalLight([0.5, 0, -1]), jvr.PointLight([11.5, 11.5, 40.0], 800.0)],
     ids=["oblique", "point"],
 )
 def test_shadow_map_of_an_opaque_block(light):
