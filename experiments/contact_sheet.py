@@ -34,7 +34,7 @@ SHAPE = (64, 64, 93)
 Pictures: TypeAlias = dict[str, dict[str, np.ndarray]]
 
 METHODS = {
-    "shadow rays": jvr.ShadowRays(2.0),
+    "shadow rays": jvr.ShadowRays(),
     "shadow volume": jvr.ShadowVolume(),
     "shadow map": jvr.ShadowMap(),
     "opacity shadow map": jvr.OpacityShadowMap(),
@@ -258,7 +258,7 @@ def sheet(found: Pictures, path: str) -> None:
         for panel, (title, rgb) in zip(panels, some.items(), strict=False):
             panel.imshow(srgb_from_linear(np.clip(rgb, 0, 1)))
             panel.set_title(title, fontsize=8, pad=3)
-    drawing.savefig(path, dpi=92, pil_kwargs={"optimize": True})
+    drawing.savefig(path, dpi=84, pil_kwargs={"optimize": True})
 
 
 def main() -> None:
