@@ -228,7 +228,7 @@ def test_one_side_and_two(x64):
     np.testing.assert_allclose(reflected(jvr.Lambert(), tilted(60), RISING), 0.5 * COLOUR, rtol=1e-12)
 
 
-@pytest.mark.parametrize("kind", [jvr.Phong, jvr.BlinnPhong])
+@pytest.mark.parametrize("kind", [pytest.param(jvr.Phong, marks=pytest.mark.slow), jvr.BlinnPhong])
 def test_highlight(kind, x64):
     """In the colour of the light: at its peak `specular`, beside it the cosine of the reflected ray or of the half-way vector."""
     for shininess in (1.0, 7.0, 1e3):

@@ -146,7 +146,7 @@ def faint_scene(rng):
     return jvr.Scene(volume.bricked(1), transfer, background=(0.1, 0.2, 0.3)), perspective(volume, 8, 6)
 
 
-@pytest.mark.parametrize("negligible", [1e-3, 1e-2])
+@pytest.mark.parametrize("negligible", [pytest.param(1e-3, marks=pytest.mark.slow), 1e-2])
 def test_what_is_negligible_stays_below_its_bound(negligible, x64):
     """In every pixel, and in every entry of its derivative in the logarithms of the extinctions, by both ways to take it."""
 

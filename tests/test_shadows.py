@@ -65,11 +65,9 @@ REFINED = {
 }
 
 
-@pytest.mark.parametrize("method", [pytest.param(m, marks=[] if m == "deep map" else pytest.mark.slow) for m in REFINED])
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=[] if n == "inside" else pytest.mark.slow) for n in LIGHTS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", REFINED)
+@pytest.mark.parametrize("name", LIGHTS)
 def test_refined_shadows_converge_to_exact_rays(method, name, x64):
     coarse, fine, left = REFINED[method]
     # The shadow is there to be seen.
@@ -98,7 +96,13 @@ def test_defaults_are_within_a_hundredth(shadows, x64):
         assert error(name, shadows) < 0.01, name
 
 
-@pytest.mark.parametrize("shadows", [jvr.ShadowVolume(0.7), jvr.OpacityShadowMap(9, 5), jvr.DeepShadowMap(9, 40, error=1e-6)])
+@pytest.mark.parametrize(
+    "shadows",
+    [
+        jvr.ShadowVolume(0.7),
+        *(pytest.param(s, marks=pytest.mark.slow) for s in (jvr.OpacityShadowMap(9, 5), jvr.DeepShadowMap(9, 40, error=1e-6))),
+    ],
+)
 def test_homogeneous_medium(shadows, x64):
     """Whatever the number of nodes, optical depth is linear along a light's ray inside of a box whose sides the light shines along."""
     volume = jvr.Volume(np.ones((6, 5, 7)))
@@ -144,6 +148,7 @@ def test_shadow_map_of_an_opaque_block(light):
     assert wrong.mean() < 0.12
 
 
+@pytest.mark.slow
 def test_shadow_map_is_hard_where_exact_shadows_are_soft(x64):
     """It does not converge in translucent media, and says so."""
     assert error("inside", jvr.ShadowMap(24)) > 0.2
@@ -188,7 +193,7 @@ def test_deep_map_keeps_its_error_and_reports_where_it_cannot(x64):
     assert picture(light, None).stats.shadows is None
 
 
-@pytest.mark.parametrize("shadows", [jvr.ShadowRays(0.7), jvr.ShadowVolume(1.0)])
+@pytest.mark.parametrize("shadows", [jvr.ShadowRays(0.7), pytest.param(jvr.ShadowVolume(1.0), marks=pytest.mark.slow)])
 def test_skipping_changes_nothing(shadows):
     """Bricks that are empty are leapt over by the eye's rays and by the light's."""
     values = voxels((17, 15, 16))
