@@ -42,7 +42,7 @@ def test_asymmetry_albedo_and_direction(volume):
     cameras, images = views(scene(volume), noise=1e-3)
     unknowns = lambda s: (s.scattering.phase.g, s.scattering.albedo, s.lights[0].direction)
     start = scene(volume, g=0.0, albedo=0.5, direction=np.array([0.0, 0.2, -1.0]))
-    result = fit(start, cameras, images, unknowns, max_steps=8)
+    result = fit(start, cameras, images, unknowns, max_steps=25)
     truth = unknowns(scene(volume))
     for found, true, error in zip(unknowns(result.scene), truth, result.standard_errors, strict=True):
         assert np.all(np.isfinite(error))
