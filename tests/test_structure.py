@@ -21,6 +21,7 @@ HEAVY = (
     "optax",
     "SimpleITK",
     "OpenEXR",
+    "OpenImageIO",
     "skimage",
     "matplotlib",
     "typer",
