@@ -84,6 +84,13 @@ if TYPE_CHECKING:
     from jvr.fitting.unknowns import Sigmoid as Sigmoid
     from jvr.fitting.unknowns import Softplus as Softplus
     from jvr.io.volumes import read_volume as read_volume
+    from jvr.model.brdf import BlinnPhongBRDF as BlinnPhongBRDF
+    from jvr.model.brdf import LambertBRDF as LambertBRDF
+    from jvr.model.brdf import PhaseBRDF as PhaseBRDF
+    from jvr.model.brdf import PhongBRDF as PhongBRDF
+    from jvr.model.dipole import Dipole as Dipole
+    from jvr.model.merl import MerlBRDF as MerlBRDF
+    from jvr.model.microfacet import MicrofacetBRDF as MicrofacetBRDF
     from jvr.model.mie import Draine as Draine
     from jvr.model.mie import JendersieEon as JendersieEon
     from jvr.model.mie import TabulatedPhase as TabulatedPhase
@@ -126,6 +133,10 @@ _LATE = {
     "jvr.fitting.solvers": ("LBFGSB", "Dogleg", "GaussNewton", "LevenbergMarquardt"),
     "jvr.fitting.unknowns": ("Identity", "Ordered", "Sigmoid", "Softplus"),
     "jvr.io.volumes": ("read_volume",),
+    "jvr.model.brdf": ("BlinnPhongBRDF", "LambertBRDF", "PhaseBRDF", "PhongBRDF"),
+    "jvr.model.dipole": ("Dipole",),
+    "jvr.model.merl": ("MerlBRDF",),
+    "jvr.model.microfacet": ("MicrofacetBRDF",),
     "jvr.model.mie": ("Draine", "JendersieEon", "TabulatedPhase"),
     "jvr.model.phase": ("DoubleHenyeyGreenstein", "HenyeyGreenstein", "Isotropic", "Mixture", "Rayleigh", "Schlick"),
     "jvr.rendering.advise": ("Advice", "advise"),
