@@ -90,8 +90,15 @@ if TYPE_CHECKING:
     from jvr.fitting.unknowns import Softplus as Softplus
     from jvr.io.precompute import precompute as precompute
     from jvr.io.volumes import read_volume as read_volume
+    from jvr.model.brdf import BlinnPhongBRDF as BlinnPhongBRDF
+    from jvr.model.brdf import LambertBRDF as LambertBRDF
+    from jvr.model.brdf import PhaseBRDF as PhaseBRDF
+    from jvr.model.brdf import PhongBRDF as PhongBRDF
+    from jvr.model.dipole import Dipole as Dipole
     from jvr.model.material import HarmonicMaterial as HarmonicMaterial
     from jvr.model.material import MaterialByValue as MaterialByValue
+    from jvr.model.merl import MerlBRDF as MerlBRDF
+    from jvr.model.microfacet import MicrofacetBRDF as MicrofacetBRDF
     from jvr.model.mie import Draine as Draine
     from jvr.model.mie import JendersieEon as JendersieEon
     from jvr.model.mie import TabulatedPhase as TabulatedPhase
@@ -138,6 +145,10 @@ _LATE = {
     "jvr.io.precompute": ("precompute",),
     "jvr.io.volumes": ("read_volume",),
     "jvr.model.material": ("HarmonicMaterial", "MaterialByValue"),
+    "jvr.model.brdf": ("BlinnPhongBRDF", "LambertBRDF", "PhaseBRDF", "PhongBRDF"),
+    "jvr.model.dipole": ("Dipole",),
+    "jvr.model.merl": ("MerlBRDF",),
+    "jvr.model.microfacet": ("MicrofacetBRDF",),
     "jvr.model.mie": ("Draine", "JendersieEon", "TabulatedPhase"),
     "jvr.model.phase": ("DoubleHenyeyGreenstein", "HenyeyGreenstein", "Isotropic", "Mixture", "Rayleigh", "Schlick"),
     "jvr.rendering.advise": ("Advice", "advise"),

@@ -112,6 +112,17 @@ def dot(a: Triple, b: Triple) -> Float[Array, "..."]:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def power_of_cosine(a: Triple, b: Triple, exponent: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`max(a . b, 0)^exponent` of unit vectors.
+
+    As `(1 - |a - b|^2 / 2)^exponent`: near the peak the cosine has no digits left that a large exponent could magnify.
+    """
+    gap = 0.5 * sum(jnp.square(x - y) for x, y in zip(a, b, strict=True))
+    # At a right angle the power is zero, and so is its derivative, or taken as such where the exponent is 1.
+    positive = gap < 1
+    return jnp.where(positive, jnp.exp(exponent * jnp.log1p(-jnp.where(positive, gap, 0.0))), 0.0)
+
+
 def ray_box(origin: Triple, direction: Triple, lower: Corner, upper: Corner) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Distances at which a ray enters and leaves an axis-aligned box (slab method, Kay and Kajiya 1986).
 

@@ -194,15 +194,18 @@ def test_orientation_of_maps():
         np.testing.assert_allclose(d[row, column], axis, atol=0.02)
 
 
-@pytest.mark.parametrize("call", [
-    lambda: jvr.sh.evaluate(-1, [[0, 0, 1]]),
-    lambda: jvr.sh.evaluate(2, [0, 0, 1]),
-    lambda: jvr.sh.order_of(jnp.ones(5)),
-    lambda: jvr.sh.rotate(jnp.ones(4), 2 * np.eye(3)),
-    lambda: jvr.sh.rotate(jnp.ones(4), -np.eye(3)),
-    lambda: jvr.sh.convolve(jnp.ones(9), jnp.ones(2)),
-    lambda: jvr.sh.project(lambda d: d[:, 0], 2, samples=10),
-])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: jvr.sh.evaluate(-1, [[0, 0, 1]]),
+        lambda: jvr.sh.evaluate(2, [0, 0, 1]),
+        lambda: jvr.sh.order_of(jnp.ones(5)),
+        lambda: jvr.sh.rotate(jnp.ones(4), 2 * np.eye(3)),
+        lambda: jvr.sh.rotate(jnp.ones(4), -np.eye(3)),
+        lambda: jvr.sh.convolve(jnp.ones(9), jnp.ones(2)),
+        lambda: jvr.sh.project(lambda d: d[:, 0], 2, samples=10),
+    ],
+)
 def test_bad_input_is_refused(call):
     with pytest.raises(ValueError, match=r"."):
         call()

@@ -218,7 +218,7 @@ def test_wrong_names(tmp_path, pixels):
     write_image(tmp_path / "a.png", pixels)
     (tmp_path / "a.png").rename(tmp_path / "a.exr")
     fails("looks like a PNG image; give the file its right extension", read_image, tmp_path / "a.exr")
-    fails("cannot read .hdr; images are .exr, .png or .jpg", read_image, tmp_path / "a.hdr")
+    fails("cannot read .tga; images are .exr, .hdr, .png or .jpg", read_image, tmp_path / "a.tga")
     (tmp_path / "b.png").mkdir()
     fails("this is a folder", read_image, tmp_path / "b.png")
     fails("cannot write .jpg; use .exr", write_image, tmp_path / "c.jpg", pixels)
@@ -290,6 +290,6 @@ def test_reading_png_needs_no_openexr():
         "path = pathlib.Path(tempfile.mkdtemp()) / 'a.png'\n"
         f"path.write_bytes({buffer.getvalue()!r})\n"
         "images.read_image(path)\n"
-        "assert not {'OpenEXR', 'SimpleITK', 'matplotlib'} & set(sys.modules)\n"
+        "assert not {'OpenEXR', 'OpenImageIO', 'SimpleITK', 'matplotlib'} & set(sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -15,7 +15,7 @@ import numpy as np
 from jvr.model.by_value import ByValue, coefficient
 from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractShading
-from jvr.numerics import direction_and_length, divide_or_zero, dot
+from jvr.numerics import direction_and_length, divide_or_zero, dot, power_of_cosine
 from jvr.types import ArrayLike, Scalar, Triple
 
 
@@ -125,17 +125,6 @@ class BlinnPhong(Phong):
     def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         half, length = direction_and_length(tuple(o + i for o, i in zip(w_o, w_i, strict=True)))
         return jnp.where(length > 0, self.specular * power_of_cosine(normal, half, self.shininess), 0.0)
-
-
-def power_of_cosine(a: Triple, b: Triple, exponent: Scalar) -> Scalar:
-    """`max(a . b, 0)^exponent` of unit vectors.
-
-    As `(1 - |a - b|^2 / 2)^exponent`: near the peak the cosine has no digits left that a large exponent could magnify.
-    """
-    gap = 0.5 * sum(jnp.square(x - y) for x, y in zip(a, b, strict=True))
-    # At a right angle the power is zero, and so is its derivative, or taken as such where the exponent is 1.
-    positive = gap < 1
-    return jnp.where(positive, jnp.exp(exponent * jnp.log1p(-jnp.where(positive, gap, 0.0))), 0.0)
 
 
 def share_of(magnitude: Scalar, threshold: Scalar) -> Scalar:

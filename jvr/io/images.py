@@ -1,4 +1,4 @@
-"""Images read and written: OpenEXR as linear radiance, PNG and JPEG through the sRGB curve.
+"""Images read and written: OpenEXR and Radiance as linear radiance, PNG and JPEG through the sRGB curve.
 
 Inside `jvr` an image is linear radiance, `(height, width, 3)`, row 0 at the top. With an alpha, colours are associated
 (multiplied by it): they are the light over black. A PNG holds colours that are not, so they are divided when one is written
@@ -23,8 +23,13 @@ from jvr.types import ArrayLike
 Pixels = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
-EXR, PNG, JPEG = b"\x76\x2f\x31\x01", b"\x89PNG", b"\xff\xd8\xff"
-KINDS = {".exr": (EXR, "an OpenEXR image"), ".png": (PNG, "a PNG image"), ".jpg": (JPEG, "a JPEG image")}
+EXR, HDR, PNG, JPEG = b"\x76\x2f\x31\x01", b"#?", b"\x89PNG", b"\xff\xd8\xff"
+KINDS = {
+    ".exr": (EXR, "an OpenEXR image"),
+    ".hdr": (HDR, "a Radiance .hdr image"),
+    ".png": (PNG, "a PNG image"),
+    ".jpg": (JPEG, "a JPEG image"),
+}
 KINDS[".jpeg"] = KINDS[".jpg"]
 
 
@@ -53,6 +58,7 @@ def read_image(path: str | os.PathLike) -> Pixels:
     - `.exr`: channels R, G, B, or Y alone (grey); half, float or integer; of a tiled file with several resolutions the finest.
       An alpha plays no part: EXR's colours are light over black already. A cropped file is placed on black where its display
       window says.
+    - `.hdr`: Radiance, 8 bits per channel and a common exponent; divided by the exposure that its header states.
     - `.png`, `.jpg`: 8 or 16 bits, taken as sRGB whatever profile the file carries; with an alpha the colours are multiplied by
       it, so that the result is light over black too.
 
@@ -61,7 +67,7 @@ def read_image(path: str | os.PathLike) -> Pixels:
     """
     path = Path(path)
     if path.suffix.lower() not in KINDS:
-        raise ImageError(path, f"cannot read {path.suffix or 'a name without an extension'}; images are .exr, .png or .jpg")
+        raise ImageError(path, f"cannot read {path.suffix or 'a name without an extension'}; images are .exr, .hdr, .png or .jpg")
     if path.is_dir():
         raise ImageError(path, "this is a folder; name one image")
     if path.exists() and path.stat().st_size == 0:
@@ -70,7 +76,8 @@ def read_image(path: str | os.PathLike) -> Pixels:
     magic, kind = KINDS[path.suffix.lower()]
     if not start.startswith(magic):
         raise ImageError(path, f"this is not {kind}, the content looks like {_kind(start)}; give the file its right extension")
-    return _read_exr(path) if magic == EXR else _read_srgb(path, start)
+    reader = {EXR: _read_exr, HDR: _read_radiance}.get(magic)
+    return _read_srgb(path, start) if reader is None else reader(path)
 
 
 def write_image(
@@ -129,8 +136,16 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def _fits_in_memory(path: Path, announced: int) -> None:
+    available = available_memory()
+    if available is not None and announced > available:
+        raise ImageError(
+            path, f"its {announced:,} bytes of pixels exceed the {available:,} bytes of free memory; crop or shrink it"
+        )
+
+
 def _kind(start: bytes) -> str:
-    known = ((EXR, "an OpenEXR image"), (b"#?", "a Radiance .hdr image"), (b"<!DOCTYPE", "a web page"), *SIGNATURES)
+    known = ((EXR, "an OpenEXR image"), (HDR, "a Radiance .hdr image"), (b"<!DOCTYPE", "a web page"), *SIGNATURES)
     printable = all(byte in b"\t\n\r" or byte >= 32 for byte in start)
     return next((name for magic, name in known if start.startswith(magic)), "text" if printable else "something else")
 
@@ -148,12 +163,7 @@ def _read_exr(path: Path) -> Pixels:
             raise ImageError(path, f"the OpenEXR header is damaged or cut short ({one_line(error)}); export it again") from error
     wanted = _colour_channels(path, header)
     low, high = _window(header["dataWindow"])
-    announced = int(np.prod(high - low)) * 4 * len(header["channels"])
-    available = available_memory()
-    if available is not None and announced > available:
-        raise ImageError(
-            path, f"its {announced:,} bytes of pixels exceed the {available:,} bytes of free memory; crop or shrink it"
-        )
+    _fits_in_memory(path, int(np.prod(high - low)) * 4 * len(header["channels"]))
     with _quiet():
         # OpenEXR says only on the terminal that pixels are missing, and then returns a file without parts.
         try:
@@ -225,6 +235,32 @@ def _quiet() -> Iterator[None]:
             stack.callback(os.dup2, kept, stream)
             os.dup2(sink.fileno(), stream)
         yield
+
+
+# --- Radiance --------------------------------------------------------------------------------------------------------
+
+
+def _read_radiance(path: Path) -> Pixels:
+    import OpenImageIO
+
+    file = OpenImageIO.ImageInput.open(str(path))
+    if file is None:
+        reason = one_line(OpenImageIO.geterror())
+        raise ImageError(path, f"the Radiance header is damaged or cut short ({reason}); copy or export it again")
+    header = file.spec()
+    exposure, gamma = (header.get_float_attribute(name, 1.0) for name in ("hdr:exposure", "oiio:Gamma"))
+    if not 0 < exposure < np.inf:
+        raise ImageError(path, f"its header states an exposure of {exposure}; it must be positive: correct it")
+    if abs(gamma - 1) > 1e-3:
+        raise ImageError(path, "its header states a GAMMA other than 1; export linear radiance")
+    _fits_in_memory(path, header.width * header.height * 3 * 4)
+    pixels = file.read_image(OpenImageIO.FLOAT)
+    if pixels is None:
+        raise ImageError(path, f"the pixels are damaged or cut short ({one_line(file.geterror())}); copy or export it again")
+    # Which corner comes first, numbered as in TIFF: 1 top left, 2 top right, 3 bottom right, 4 bottom left.
+    corner = header.get_int_attribute("Orientation", 1)
+    upright = pixels[:: -1 if corner in (3, 4) else 1, :: -1 if corner in (2, 3) else 1]
+    return np.ascontiguousarray(upright, np.float32) / np.float32(exposure)
 
 
 # --- PNG, JPEG -------------------------------------------------------------------------------------------------------

@@ -1,0 +1,151 @@
+"""Reflectance as material functions: which share of the light from one direction a surface sends into another.
+
+The material function is `M(w_o, w_i) = f(w_o, w_i) max(n . w_i, 0)`, the BRDF times the cosine, per solid angle of `w_i`: its
+integral over the sphere is the share reflected to `w_o` of light that is the same from everywhere. All are isotropic and in the
+surface's own frame: `n = (0, 0, 1)`, and `w_o`, `w_i` are unit directions that point away from the point, to the eye and to the light.
+
+A material function has two parts: `tinted` is multiplied with the colour of the transfer function, `plain` keeps the colour of the
+light, as highlights of everything but metals do.
+"""
+
+import math
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jvr.model.checks import float_array, require
+from jvr.model.material import About, AbstractBRDF
+from jvr.model.phase import AbstractPhase, ScatteringAngle, components
+from jvr.numerics import direction_and_length, power_of_cosine
+from jvr.types import ArrayLike, Channels, Scalar, Triple
+
+
+class LambertBRDF(AbstractBRDF):
+    """Matte: `M = reflectance / pi max(n . w_i, 0)`, tinted.
+
+    **Arguments:** `reflectance`: share reflected, in [0, 1], a number or `(3,)`; differentiable. **Raises** `ValueError` otherwise.
+    """
+
+    about: ClassVar[About] = "normal"
+    reflectance: Float[Array, "..."]
+
+    def __init__(self, reflectance: ArrayLike = 1.0):
+        self.reflectance = share(reflectance, "reflectance", (), (3,))
+
+    def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
+        return matte(self.reflectance, w_i), ()
+
+
+class PhongBRDF(AbstractBRDF):
+    """Matte and a glossy lobe about the mirrored light (Lafortune and Willems 1994, Using the modified Phong reflectance model for
+    physically based rendering): tinted `diffuse / pi max(n . w_i, 0)`, plain `specular (e + 2) / (2 pi) max(r . w_o, 0)^e max(n . w_i, 0)`.
+
+    Reciprocal. The lobe reflects the share `specular` to an eye that looks straight down, less to others: what of the lobe lies below
+    the surface is lost.
+
+    **Arguments:** `diffuse`, `specular`: in [0, 1], each a number or `(3,)`; where their sum is at most 1 no more is reflected than
+    arrives. `exponent`: `e`, a number, not negative. All differentiable. **Raises** `ValueError` otherwise.
+    """
+
+    about: ClassVar[About] = "both"
+    diffuse: Float[Array, "..."]
+    specular: Float[Array, "..."]
+    exponent: Scalar
+
+    def __init__(self, diffuse: ArrayLike = 0.7, specular: ArrayLike = 0.3, exponent: ArrayLike = 30.0):
+        self.diffuse, self.specular = share(diffuse, "diffuse", (), (3,)), share(specular, "specular", (), (3,))
+        self.exponent = _exponent(exponent)
+
+    def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
+        mirrored = (-w_i[0], -w_i[1], w_i[2])
+        lobe = (self.exponent + 2.0) / (2.0 * math.pi) * power_of_cosine(mirrored, w_o, self.exponent)
+        return matte(self.diffuse, w_i), _gloss(self.specular, lobe, w_o, w_i)
+
+
+class BlinnPhongBRDF(AbstractBRDF):
+    """As `PhongBRDF` with the lobe `specular (e + 2) (e + 4) / (8 pi (2^(-e/2) + e)) max(n . h, 0)^e max(n . w_i, 0)`, `h` half-way
+    between the directions to eye and light.
+
+    The factor makes the share reflected straight up exactly `specular` (Giesen 2009, Phong and Blinn-Phong normalization factors); the
+    common `(e + 8) / (8 pi)` reflects up to 8 % more than arrives. Exponent 0 is Lambert's.
+    """
+
+    about: ClassVar[About] = "both"
+    diffuse: Float[Array, "..."]
+    specular: Float[Array, "..."]
+    exponent: Scalar
+
+    def __init__(self, diffuse: ArrayLike = 0.7, specular: ArrayLike = 0.3, exponent: ArrayLike = 30.0):
+        self.diffuse, self.specular = share(diffuse, "diffuse", (), (3,)), share(specular, "specular", (), (3,))
+        self.exponent = _exponent(exponent)
+
+    def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
+        half, _ = direction_and_length(tuple(o + i for o, i in zip(w_o, w_i, strict=True)))
+        e, normal = self.exponent, (jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
+        factor = (e + 2.0) * ((e + 4.0) / (8.0 * math.pi * (jnp.exp2(-0.5 * e) + e)))
+        return matte(self.diffuse, w_i), _gloss(self.specular, factor * power_of_cosine(half, normal, e), w_o, w_i)
+
+
+class PhaseBRDF(AbstractBRDF):
+    """A medium without surface: tinted `albedo p(cos theta)`, `cos theta = -w_o . w_i`, and no cosine of `w_i`.
+
+    **Arguments:** `phase`: any phase function, such as `jvr.HenyeyGreenstein(0.6)`; `albedo`: in [0, 1], a number or `(3,)`.
+    All differentiable. **Raises** `ValueError` otherwise.
+    """
+
+    about: ClassVar[About] = "eye"
+    phase: AbstractPhase
+    albedo: Float[Array, "..."]
+
+    def __init__(self, phase: AbstractPhase, albedo: ArrayLike = 1.0):
+        self.phase, self.albedo = phase, share(albedo, "albedo", (), (3,))
+
+    def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
+        # Of one shape: a phase function's derivative rules do not broadcast.
+        w_o, w_i = of_one_shape(w_o, w_i)
+        values = self.phase.evaluate(ScatteringAngle.between(w_o, w_i))
+        albedo = [a for (a,) in components(self.albedo)]
+        n = max(len(values), len(albedo))
+        return tuple(albedo[c % len(albedo)] * values[c % len(values)] for c in range(n)), ()
+
+
+def matte(reflectance: Float[Array, "..."], w_i: Triple) -> Channels:
+    """Lambert's `reflectance / pi max(n . w_i, 0)` for each component of the reflectance."""
+    facing = jnp.maximum(w_i[2], 0.0) / math.pi
+    return tuple(r * facing for (r,) in components(reflectance))
+
+
+def above(w_o: Triple, w_i: Triple) -> Bool[Array, "..."]:
+    """Whether both directions are above the surface, so that light can be reflected from one into the other."""
+    return (w_o[2] > 0) & (w_i[2] > 0)
+
+
+def of_one_shape(w_o: Triple, w_i: Triple) -> tuple[Triple, Triple]:
+    """Both directions with all components broadcast to one shape."""
+    every = jnp.broadcast_arrays(*w_o, *w_i)
+    return tuple(every[:3]), tuple(every[3:])
+
+
+def where_or_normal(lit: Bool[Array, "..."], w: Triple) -> Triple:
+    """`w` where `lit`, else the normal: there every derivative of what is then left out is finite."""
+    return jnp.where(lit, w[0], 0.0), jnp.where(lit, w[1], 0.0), jnp.where(lit, w[2], 1.0)
+
+
+def share(value: ArrayLike, name: str, *shapes: tuple[int, ...]) -> Float[Array, "..."]:
+    """A share between 0 and 1 as an array of one of the shapes."""
+    array = float_array(value, name, *shapes)
+    require(array, lambda a: (a >= 0) & (a <= 1), f"{name} must be in [0, 1], a share of the light")
+    return array
+
+
+def _exponent(value: ArrayLike) -> Scalar:
+    exponent = float_array(value, "exponent", ())
+    require(exponent, lambda e: np.isfinite(e) & (e >= 0), "exponent must be finite and not negative; 30 is a soft highlight")
+    return exponent
+
+
+def _gloss(specular: Float[Array, "..."], lobe: Float[Array, "..."], w_o: Triple, w_i: Triple) -> Channels:
+    received = jnp.where(above(w_o, w_i), lobe * w_i[2], 0.0)
+    return tuple(s * received for (s,) in components(specular))
