@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 from scenes import rotation
 from scipy.special import sph_harm_y
 
@@ -219,4 +220,4 @@ def test_gradients_of_rotation_and_products():
             turn = jnp.array([[jnp.cos(angle), -jnp.sin(angle), 0], [jnp.sin(angle), jnp.cos(angle), 0], [0, 0, 1]])
             return jnp.sum(jnp.sin(jvr.sh.product(jvr.sh.rotate(c, turn), e)))
 
-        jax.test_util.check_grads(f, (c, e, jnp.asarray(0.7)), order=1, modes=("fwd", "rev"), rtol=1e-6)
+        check_grads(f, (c, e, jnp.asarray(0.7)), order=1, modes=("fwd", "rev"), rtol=1e-6)

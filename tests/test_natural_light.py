@@ -1,6 +1,7 @@
 """Light from all around, materials under it, and radiance transfer: closed forms, white furnace, independent sums, gradients."""
 
 import dataclasses
+import itertools
 import math
 
 import jax
@@ -186,13 +187,14 @@ def test_above_an_opaque_half_space_is_a_hemisphere():
         radiance_transfer=jvr.RadianceTransfer(rays=1024, resolution=0.1, start=0.0),
     )
     projection = TransferProjection.of(half_space, absorbing(half_space, None, False))
-    c, opened = compiled(lambda q, p: q.project(p))(projection, jnp.array([[20.0, 20.0, 10.2]]))
+    c, opened = compiled(lambda q, p: q.project(p))(projection, jnp.array([[20.0, 20.0, 10.2], [20.0, 20.0, 9.9]]))
     from jvr.model.harmonics.projection import cap
 
     expected = np.zeros(16)
     expected[np.arange(4) * np.arange(1, 5)] = jnp.stack(cap(jnp.asarray(0.0), 3))
     np.testing.assert_allclose(c[0, 0], expected, atol=0.05)
-    assert 0.5 <= float(opened[0]) < 1
+    # Above it the whole sphere is asked, at the surface the half above.
+    np.testing.assert_allclose(opened, [1.0, 0.5], atol=0.02)
 
 
 def test_transfer_is_a_plain_sum_over_rays():
@@ -228,7 +230,7 @@ def test_transfer_is_a_plain_sum_over_rays():
         with np.errstate(divide="ignore"):
             out = min(np.maximum((0 - p) / along, (np.array(volume.shape) - 1 - p) / along))
         tau = 0.0
-        for begin, end in zip(ends[:-1], ends[1:], strict=True):
+        for begin, end in itertools.pairwise(ends):
             low, high = min(begin, out), min(end, out)
             tau += (high - low) * extinction(p + 0.5 * (low + high) * along) if high > low else 0.0
         total += math.exp(-tau) * np.asarray(jvr.sh.evaluate(2, d[None])[0]) * 2 * math.pi * (1 + sine) / 7
@@ -261,12 +263,7 @@ def test_clipped_medium_is_not_in_the_way():
 
 def test_luma_and_colour_differences_are_the_same_colours():
     transfer = jvr.RadianceTransfer(resolution=1.0, bleeding=jvr.TransferBleeding(), chromaticity=3)
-    whole = picture(
-        scene(
-            transfer=dataclasses.replace(scene(), radiance_transfer=None)
-            and jvr.RadianceTransfer(resolution=1.0, bleeding=jvr.TransferBleeding())
-        )
-    )
+    whole = picture(scene(transfer=jvr.RadianceTransfer(resolution=1.0, bleeding=jvr.TransferBleeding())))
     np.testing.assert_allclose(picture(scene(transfer=transfer)), whole, rtol=1e-4)
 
 
@@ -356,7 +353,7 @@ def test_a_transfer_that_takes_too_much_memory_is_refused():
     ],
 )
 def test_parts_that_do_not_go_together_are_refused(parts):
-    with pytest.raises(ValueError, match="set environment|set material|radiance transfer"):
+    with pytest.raises(ValueError, match=r"set environment|set material|radiance transfer"):
         jvr.Scene(jvr.Volume(voxels()), linear_transfer(), **({"environment": light(), "material": jvr.LambertBRDF()} | parts))
 
 
@@ -386,7 +383,11 @@ GRADIENTS = {
 }
 
 
-@pytest.mark.parametrize("name", GRADIENTS)
+# Each takes ten seconds and more to compile.
+SLOW = ("roughness", "transfer function through bleeding", "voxels")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in GRADIENTS])
 def test_gradients_against_differences(name):
     """Reverse mode, forward mode and central differences in float64, in a random direction of the unknowns."""
     path, material, transfer = GRADIENTS[name]

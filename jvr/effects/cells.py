@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.numerics import computed_once
-from jvr.types import Channels, Scalar, Triple
+from jvr.types import Channels, Triple
 
 # Up to so many channels the nodes around a cell are kept side by side, at eight times the memory.
 FEW = 4
@@ -19,7 +19,9 @@ class AbstractGrid(eqx.Module):
     cells: tuple[int, int, int] = eqx.field(static=True)
 
     @abc.abstractmethod
-    def read(self, low: tuple[Int[Array, "points"], ...], shares: list[Scalar], wanted: Bool[Array, "points"]) -> Channels:
+    def read(
+        self, low: tuple[Int[Array, "points"], ...], shares: list[Float[Array, "..."]], wanted: Bool[Array, "points"]
+    ) -> Channels:
         """Each channel inside of cells whose first node is `low`, with fractions of the way to the last."""
 
     def interpolate(self, at: Triple, wanted: Bool[Array, "points"]) -> Channels:
@@ -37,7 +39,9 @@ class Cells(AbstractGrid):
 
     rows: Float[Array, "channels cells 8"]
 
-    def read(self, low: tuple[Int[Array, "points"], ...], shares: list[Scalar], wanted: Bool[Array, "points"]) -> Channels:
+    def read(
+        self, low: tuple[Int[Array, "points"], ...], shares: list[Float[Array, "..."]], wanted: Bool[Array, "points"]
+    ) -> Channels:
         _, ny, nz = (max(n, 1) for n in self.cells)
         cell = (low[0] * ny + low[1]) * nz + low[2]
         found = computed_once(wanted, [rows.at[cell].get(mode="promise_in_bounds") for rows in self.rows])
@@ -49,7 +53,9 @@ class Nodes(AbstractGrid):
 
     rows: Float[Array, "nodes channels"]
 
-    def read(self, low: tuple[Int[Array, "points"], ...], shares: list[Scalar], wanted: Bool[Array, "points"]) -> Channels:
+    def read(
+        self, low: tuple[Int[Array, "points"], ...], shares: list[Float[Array, "..."]], wanted: Bool[Array, "points"]
+    ) -> Channels:
         shape = [n + 1 for n in self.cells]
         total = jnp.zeros((shares[0].shape[0], self.rows.shape[1]), self.rows.dtype)
         for a in range(2 if shape[0] > 1 else 1):

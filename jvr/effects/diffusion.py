@@ -1,6 +1,5 @@
 """The scattering pass: light that the medium spreads over a neighbourhood (Lindemann and Ropinski 2010, section 4.2)."""
 
-import itertools
 import math
 
 import jax
@@ -57,11 +56,10 @@ def kernel_of(dipole: Dipole, radius: float, volume: Volume, shape: tuple[int, .
     axes = volume.world_from_grid[:3, :3] * jnp.asarray(steps)
     length = lambda offset: jnp.linalg.norm(offset @ axes.T, axis=-1)
     inside = length(jnp.asarray(offsets, axes.dtype)) <= radius * longest * jnp.max(volume.spacing)
-    fractions = (np.arange(PLACES) + 0.5) / PLACES - 0.5
-    total = jnp.zeros((3, *offsets.shape[:3]), axes.dtype)
-    for fraction in itertools.product(fractions, repeat=3):
-        total += jnp.stack(dipole.reflectance(length(jnp.asarray(offsets + np.array(fraction), axes.dtype))))
-    return jnp.where(inside, total / PLACES**3, 0.0)
+    fractions = np.stack(np.meshgrid(*[(np.arange(PLACES) + 0.5) / PLACES - 0.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = offsets[..., None, :] + fractions
+    values = jnp.stack(dipole.reflectance(length(jnp.asarray(places, axes.dtype))))
+    return jnp.where(inside, jnp.mean(values, axis=-1), 0.0)
 
 
 def _convolved(field: Float[Array, "x y z"], kernel: Float[Array, "i j k"]) -> Float[Array, "x y z"]:

@@ -4,7 +4,7 @@ sections 4 and 4.1), projected on spherical harmonics at the nodes of a coarse g
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -22,7 +22,9 @@ from jvr.model.light import perpendicular
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import ClippingBox, Volume
 from jvr.numerics import direction_and_length, ray_box
-from jvr.types import Channels, Scalar, Triple
+from jvr.types import Channels, Triple
+
+Numbers: TypeAlias = Float[Array, "..."]
 
 # Nodes that are projected together in one program.
 CHUNK = 256
@@ -126,19 +128,19 @@ class RadianceTransfer(AbstractRadianceTransfer):
         self,
         order: int = 3,
         rays: int = 64,
-        resolution: float = 1 / 3,
+        resolution: float | int = 1 / 3,
         *,
         bleeding: TransferBleeding | MaterialBleeding | None = None,
         scattering: Any = None,
-        neighbourhood: float = 0.1,
+        neighbourhood: float | int = 0.1,
         exact: bool = False,
         chromaticity: int | None = None,
-        step: float = 1.0,
-        growth: float = 1.1,
-        start: float = 3.0,
-        termination: float = 0.05,
-        surface: float = 0.1,
-        memory: float = 2e9,
+        step: float | int = 1.0,
+        growth: float | int = 1.1,
+        start: float | int = 3.0,
+        termination: float | int = 0.05,
+        surface: float | int = 0.1,
+        memory: float | int = 2e9,
     ):
         wrong = {
             "order must be a whole number from 0 to 10": not isinstance(order, int) or not 0 <= order <= 10,
@@ -232,7 +234,7 @@ class Cone(NamedTuple):
     """The part of the sphere that rays of a node are sent into: unit axis in the world, and `sin alpha`."""
 
     axis: Triple
-    sine: Scalar
+    sine: Numbers
 
 
 def node_positions(volume: Volume, shape: tuple[int, int, int]) -> np.ndarray:
@@ -273,7 +275,7 @@ def _cone(transfer: RadianceTransfer, volume: Volume, medium: Medium, p: Triple)
     lower, upper = volume.domain
     half = 0.5 / transfer.resolution
 
-    def transparency(p: Triple) -> Scalar:
+    def transparency(p: Triple) -> Numbers:
         p = tuple(jnp.clip(c, low, high) for c, low, high in zip(p, lower, upper, strict=True))
         sigma_t = classify_at(medium, _points(p, p), jnp.ones(p[0].shape, bool))[0].sigma_t
         return jnp.exp(-width * sum(sigma_t[1:], sigma_t[0]) / len(sigma_t))
@@ -309,8 +311,8 @@ class _Rays(NamedTuple):
     p: Triple
     direction: Triple
     along: Triple
-    t_in: Scalar
-    t_out: Scalar
+    t_in: Numbers
+    t_out: Numbers
 
 
 def _rays(volume: Volume, clipping: ClippingBox | None, p: Triple, direction: Triple) -> _Rays:
@@ -331,7 +333,7 @@ def _carried(transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo:
     lower, upper = volume.domain
     toward_origin = tuple(-d for d in rays.direction)
 
-    def one_step(state: tuple[Channels, Channels], ends: tuple[Scalar, Scalar]) -> tuple[Channels, Channels]:
+    def one_step(state: tuple[Channels, Channels], ends: tuple[Numbers, Numbers]) -> tuple[Channels, Channels]:
         tau, colour = state
         begin, end = (jnp.clip(e, rays.t_in, rays.t_out) for e in ends)
         middle = 0.5 * (begin + end)
@@ -349,7 +351,7 @@ def _carried(transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo:
 
     # Checkpointed: the way back computes a step again rather than keep all of its voxels.
     @jax.checkpoint
-    def step(state: tuple[Channels, Channels], ends: tuple[Scalar, Scalar]) -> tuple[tuple[Channels, Channels], None]:
+    def step(state: tuple[Channels, Channels], ends: tuple[Numbers, Numbers]) -> tuple[tuple[Channels, Channels], None]:
         alive = (ends[0] < rays.t_out) & (ends[1] > rays.t_in) & (_least(state[0]) < opaque)
         return jax.lax.cond(jnp.any(alive), lambda s: one_step(s, ends), lambda s: s, state), None
 
@@ -366,7 +368,7 @@ def _colour(rgb: Triple, sample: Any, albedo: NaturalLight | None, w_o: Triple) 
     if albedo is None:
         return rgb
 
-    def one(s: Scalar, gradient: Triple, w_o: Triple) -> tuple[Triple, Triple]:
+    def one(s: Numbers, gradient: Triple, w_o: Triple) -> tuple[Triple, Triple]:
         normal, magnitude = direction_and_length(tuple(-g for g in gradient))
         return albedo.reflect(s, magnitude, normal, w_o, ())
 
@@ -374,7 +376,7 @@ def _colour(rgb: Triple, sample: Any, albedo: NaturalLight | None, w_o: Triple) 
     return tuple(c * a + b for c, a, b in zip(rgb, tinted, plain, strict=True))
 
 
-def _least(tau: Channels) -> Scalar:
+def _least(tau: Channels) -> Numbers:
     """Optical depth of the clearest channel."""
     least = tau[0]
     for t in tau[1:]:

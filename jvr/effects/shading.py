@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jvr.model.by_value import ByValue, coefficient
 from jvr.model.checks import float_array, require
@@ -127,7 +128,7 @@ class BlinnPhong(Phong):
         return jnp.where(length > 0, self.specular * power_of_cosine(normal, half, self.shininess), 0.0)
 
 
-def share_of(magnitude: Scalar, threshold: Scalar) -> Scalar:
+def share_of(magnitude: Float[Array, "..."], threshold: Scalar) -> Float[Array, "..."]:
     """`m^2 / (m^2 + t^2)`, by the ratio of the smaller to the larger, so that no square overflows; 0 where `m` is 0."""
     larger, smaller = jnp.maximum(magnitude, threshold), jnp.minimum(magnitude, threshold)
     ratio = jnp.square(divide_or_zero(smaller, larger))

@@ -24,8 +24,8 @@ from jvr.types import Channels, Scalar
 
 # Leaps before a ray is started.
 FIRST_LEAPS = 4
-# Optical depth of a segment, and of a voxel on the way of light, beyond which denser media are lit alike: light gets about as deep into them
-# as the eye sees. Without it the two would be compared at distances that a position in single precision cannot tell apart.
+# Optical depth of a segment, and of a voxel on the way of light, beyond which denser media are lit alike: light gets about as deep into
+# them as the eye sees. Without it the two would be compared at distances that a position in single precision cannot tell apart.
 DENSEST = 64.0
 
 

@@ -36,7 +36,7 @@ class EnvironmentLight(eqx.Module):
 
     @classmethod
     def from_image(
-        cls, image: str | os.PathLike | ArrayLike, order: int = 3, *, window: float | None = None, clamped: bool = True
+        cls, image: str | os.PathLike | ArrayLike, order: int = 3, *, window: float | int | None = None, clamped: bool = True
     ) -> "EnvironmentLight":
         """The projection of a latitude-longitude map, y up: +X at u = 1/4, +Z at the centre, -X at u = 3/4.
 
@@ -59,7 +59,7 @@ class EnvironmentLight(eqx.Module):
 
     @classmethod
     def from_function(
-        cls, fn: Callable[[Float[Array, "n 3"]], Float[Array, "n 3"]], order: int = 3, *, window: float | None = None
+        cls, fn: Callable[[Float[Array, "n 3"]], Float[Array, "n 3"]], order: int = 3, *, window: float | int | None = None
     ) -> "EnvironmentLight":
         """The projection of radiance given as a function of unit directions, `(n, 3)` -> `(n, 3)`."""
         return cls(_windowed(harmonics.project(fn, order), window))
@@ -103,5 +103,5 @@ class EnvironmentLight(eqx.Module):
         return EnvironmentLight(large.at[: len(small)].add(small), clamped=self.clamped and other.clamped)
 
 
-def _windowed(coefficients: Float[Array, "bands 3"], window: float | None) -> Float[Array, "bands 3"]:
+def _windowed(coefficients: Float[Array, "bands 3"], window: float | int | None) -> Float[Array, "bands 3"]:
     return coefficients if window is None else harmonics.window(coefficients, window)

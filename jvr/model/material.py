@@ -10,7 +10,7 @@ harmonics of `m >= 0` occur, with coefficients `rho_lm` that depend on the angle
 import abc
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import equinox as eqx
 import jax
@@ -104,7 +104,7 @@ class AbstractBRDF(AbstractMaterial):
     fitted; `jvr.HarmonicMaterial.project` does it once."""
 
     # What it is symmetric about, see `Lobe`.
-    about: eqx.AbstractClassVar[About]
+    about: ClassVar[About]
 
     @abc.abstractmethod
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:

@@ -62,7 +62,7 @@ def sphere_nodes(degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_samples(
-    directions: ArrayLike, values: ArrayLike, order: int, *, weights: ArrayLike | None = None, ridge: float = 0.0
+    directions: ArrayLike, values: ArrayLike, order: int, *, weights: ArrayLike | None = None, ridge: float | int = 0.0
 ) -> Float[Array, "bands *rest"]:
     """Coefficients by least squares, for samples that do not cover the sphere: `min sum_i w_i |Y(d_i) c - f_i|^2 + ridge n |c|^2`.
 
@@ -146,7 +146,7 @@ def convolve(coefficients: ArrayLike, kernel: ArrayLike) -> Float[Array, "bands 
     return _by_band(coefficients, factor.astype(coefficients.dtype))
 
 
-def window(coefficients: ArrayLike, width: float) -> Float[Array, "bands *rest"]:
+def window(coefficients: ArrayLike, width: float | int) -> Float[Array, "bands *rest"]:
     """Weaker high bands against ringing: band `l` times Lanczos's `sinc(l / width)` for `l` below `width`, else 0.
 
     A small `width` blurs more and rings less; `width = 2 (order + 1)` is mild. Constants stay as they are. **Raises** `ValueError` where
