@@ -30,7 +30,7 @@ class AbstractBRDF(eqx.Module):
     """How a point of a surface, or of a medium, reflects."""
 
     # "normal" where M depends on `w_i` and the normal alone, "eye" where on the angle between `w_o` and `w_i` alone.
-    about: eqx.AbstractClassVar[About]
+    about: ClassVar[About]
 
     @abc.abstractmethod
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
