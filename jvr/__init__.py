@@ -12,12 +12,14 @@ from jvr.march.oracle import LocalError as LocalError
 from jvr.march.oracle import OpacityChange as OpacityChange
 from jvr.march.quadrature import Midpoint as Midpoint
 from jvr.march.quadrature import PreIntegrated as PreIntegrated
+from jvr.model import harmonics
 from jvr.model import presets as presets
 from jvr.model.by_value import ByValue as ByValue
 from jvr.model.camera import OrthographicCamera as OrthographicCamera
 from jvr.model.camera import PerspectiveCamera as PerspectiveCamera
 from jvr.model.camera import fibonacci_sphere as fibonacci_sphere
 from jvr.model.camera import orbit as orbit
+from jvr.model.environment import EnvironmentLight as EnvironmentLight
 from jvr.model.gradient_transfer import GradientOpacity as GradientOpacity
 from jvr.model.gradient_transfer import GradientTransfer as GradientTransfer
 from jvr.model.light import AmbientLight as AmbientLight
@@ -55,6 +57,9 @@ from jvr.types import Outcome as Outcome
 
 if TYPE_CHECKING:
     from jvr.effects.deep_shadow_map import DeepShadowMap as DeepShadowMap
+    from jvr.effects.radiance_transfer import MaterialBleeding as MaterialBleeding
+    from jvr.effects.radiance_transfer import RadianceTransfer as RadianceTransfer
+    from jvr.effects.radiance_transfer import TransferBleeding as TransferBleeding
     from jvr.effects.scattering import SingleScattering as SingleScattering
     from jvr.effects.shading import BlinnPhong as BlinnPhong
     from jvr.effects.shading import Lambert as Lambert
@@ -83,12 +88,15 @@ if TYPE_CHECKING:
     from jvr.fitting.unknowns import Ordered as Ordered
     from jvr.fitting.unknowns import Sigmoid as Sigmoid
     from jvr.fitting.unknowns import Softplus as Softplus
+    from jvr.io.precompute import precompute as precompute
     from jvr.io.volumes import read_volume as read_volume
     from jvr.model.brdf import BlinnPhongBRDF as BlinnPhongBRDF
     from jvr.model.brdf import LambertBRDF as LambertBRDF
     from jvr.model.brdf import PhaseBRDF as PhaseBRDF
     from jvr.model.brdf import PhongBRDF as PhongBRDF
     from jvr.model.dipole import Dipole as Dipole
+    from jvr.model.material import HarmonicMaterial as HarmonicMaterial
+    from jvr.model.material import MaterialByValue as MaterialByValue
     from jvr.model.merl import MerlBRDF as MerlBRDF
     from jvr.model.microfacet import MicrofacetBRDF as MicrofacetBRDF
     from jvr.model.mie import Draine as Draine
@@ -107,11 +115,13 @@ if TYPE_CHECKING:
     from jvr.rendering.tune import Tuned as Tuned
     from jvr.rendering.tune import tune as tune
 
+sh = harmonics
 __version__ = "0.1.0"
 
 # Fitting alone takes longer to import than JAX, so it and the readers are imported by their first use; so are effects, of which
 # a scene without them needs none.
 _LATE = {
+    "jvr.effects.radiance_transfer": ("MaterialBleeding", "RadianceTransfer", "TransferBleeding"),
     "jvr.effects.scattering": ("SingleScattering",),
     "jvr.effects.shading": ("BlinnPhong", "Lambert", "Phong"),
     "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
@@ -132,7 +142,9 @@ _LATE = {
     "jvr.fitting.residuals": ("residuals",),
     "jvr.fitting.solvers": ("LBFGSB", "Dogleg", "GaussNewton", "LevenbergMarquardt"),
     "jvr.fitting.unknowns": ("Identity", "Ordered", "Sigmoid", "Softplus"),
+    "jvr.io.precompute": ("precompute",),
     "jvr.io.volumes": ("read_volume",),
+    "jvr.model.material": ("HarmonicMaterial", "MaterialByValue"),
     "jvr.model.brdf": ("BlinnPhongBRDF", "LambertBRDF", "PhaseBRDF", "PhongBRDF"),
     "jvr.model.dipole": ("Dipole",),
     "jvr.model.merl": ("MerlBRDF",),

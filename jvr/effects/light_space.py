@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jvr.march.march import Medium
+from jvr.march.march import Medium, classify_at
 from jvr.march.steps import Point
 from jvr.model.light import AbstractLight, DirectionalLight, perpendicular
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.numerics import computed_once, direction_and_length, dot, ray_box
+from jvr.numerics import direction_and_length, dot, ray_box
 from jvr.types import Channels, Scalar, Triple, Vector
 
 # A light nearer to the bounding sphere of the volume than this share of its radius shines in all directions.
@@ -150,9 +150,7 @@ def depth_between(medium: Medium, volume: Volume, rays: LightRays, begin: Scalar
     # Where nothing is inside, and by a rounding elsewhere, the middle may be outside, where nothing may be read.
     p = tuple(jnp.clip(c, first, last) for c, first, last in zip(p, *volume.domain, strict=True))
     point = Point(p, rays.direction, *(jnp.zeros_like(middle, jnp.int32),) * 2)
-    samples = computed_once(inside, jax.vmap(medium.field.resample)(point))
-    prepared = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, point)
-    sigma_t = jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, prepared).sigma_t
+    sigma_t = classify_at(medium, point, inside)[0].sigma_t
     return tuple(jnp.where(inside, sigma * (high - low), 0.0) for sigma in sigma_t)
 
 

@@ -2,9 +2,10 @@
 
 `a` is what shading makes of the light (1 without shading), `b` what is reflected in the light's own colour and what is scattered:
 
-    a = k_ambient L_ambient + sum_lights E T_light reflect,    b = sum_lights E T_light (specular + albedo p(cos theta)).
+    a = k_ambient L_ambient + sum_lights E T_light reflect + integral M_tinted L T,
+    b = sum_lights E T_light (specular + albedo p(cos theta)) + integral M_plain L T.
 
-Lights, shading, shadows and scattering of the scene come together here; each says for itself what it does.
+Lights, shading, shadows, scattering, and material and environment of the scene come together here; each says for itself what it does.
 """
 
 from typing import Any
@@ -30,6 +31,7 @@ class LitShader(OpticalShader):
     ambient: tuple[AmbientLight, ...]
     shading: AbstractShading | None
     scattering: AbstractScattering | None
+    natural: Any = None  # a `jvr.effects.natural_light.NaturalLight`, where there is light from all around
 
     def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         factor, added = self.light_at(sample, point)
@@ -47,8 +49,11 @@ class LitShader(OpticalShader):
         scatters = zero + 1 if scattering is None or not scattering.needs_gradient else scattering.share(magnitude)
         # Where there is a switch, what is not a surface scatters and does not reflect.
         reflects = 1 - scatters if scattering is not None and scattering.needs_gradient else zero + 1
-        factor, added = [zero if shading is not None else zero + 1] * 3, [zero] * 3
-        for light, transmittance in zip(self.lights, sample.light or ((),) * len(self.lights), strict=True):
+        # A medium that nothing reflects from glows as it is.
+        glows = shading is None and self.natural is None
+        factor, added = [zero + 1 if glows else zero] * 3, [zero] * 3
+        arrives = sample.light or ((),) * (len(self.lights) + 1)
+        for light, transmittance in zip(self.lights, arrives, strict=False):
             towards, _, irradiance = light.arrives(x, w_o)
             arriving = _times(irradiance, transmittance)
             if shading is not None:
@@ -65,6 +70,11 @@ class LitShader(OpticalShader):
             if scattering is not None:
                 scattered = _times(light.rgb, scattering.scatter_ambient())
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
+        if self.natural is not None:
+            around = arrives[len(self.lights)] if len(arrives) > len(self.lights) else ()
+            tinted, plain = self.natural.reflect(sample.s, magnitude, normal, w_o, around)
+            factor = [f + reflects * c for f, c in zip(factor, tinted, strict=True)]
+            added = [b + reflects * c for b, c in zip(added, plain, strict=True)]
         return tuple(factor), tuple(added)
 
 

@@ -4,15 +4,16 @@ import math
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
+from jvr.effects.cells import AbstractGrid, grid_of
 from jvr.effects.light_space import AbstractLightSpace, depth_nodes, light_space
 from jvr.march.march import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
-from jvr.numerics import computed_once, transformed
+from jvr.numerics import transformed
 from jvr.types import Affine, Channels, Scalar, Triple
 
 
@@ -71,39 +72,17 @@ class OpacityShadowMap(AbstractShadows):
 
 
 class ClearGrid(eqx.Module):
-    """Transmittance between one light and nodes of its coordinates, equally distant in each. `cells` holds the eight nodes around every
-    cell side by side, so that one read brings them all; nodes of cell `(i, j, k)` are `(i + a, j + b, k + c)` in the order of `a b c`."""
+    """Transmittance between one light and nodes of its coordinates, equally distant in each."""
 
     space: AbstractLightSpace
-    cells: Float[Array, "channels cells 8"]
-    texels: int = eqx.field(static=True)
-    layers: int = eqx.field(static=True)
+    grid: AbstractGrid
 
     def transmittance(self, x: Triple, inside: Bool[Array, "points"]) -> Channels:
         """At a batch of world positions, trilinear. (Not optical depth: behind an opaque surface that is so large that between two nodes
         it would be opaque as well.)"""
-        sizes = (self.texels - 1, self.texels - 1, self.layers)
         u, v, w = self.space.place(x)
-        at = [jnp.clip(c * n, 0, n) for c, n in zip(((u + 1) / 2, (v + 1) / 2, w), sizes, strict=True)]
-        low = [jnp.clip(jnp.floor(c), 0, n - 1) for c, n in zip(at, sizes, strict=True)]
-        i, j, k = (c.astype(jnp.int32) for c in low)
-        # Else places are computed anew for each number that is read.
-        cell, shares = computed_once(inside, ((i * sizes[1] + j) * sizes[2] + k, [c - b for c, b in zip(at, low, strict=True)]))
-        found = computed_once(inside, [rows.at[cell].get(mode="promise_in_bounds") for rows in self.cells])
-        return tuple(_trilinear([row[:, c] for c in range(8)], shares) for row in found)
-
-
-def _trilinear(values: list[Array], shares: list[Array]) -> Array:
-    for share in reversed(shares):
-        values = [(1 - share) * a + share * b for a, b in zip(values[::2], values[1::2], strict=True)]
-    return values[0]
-
-
-def cells_of(nodes: Float[Array, "u v w channels"]) -> Float[Array, "channels cells 8"]:
-    """The nodes around every cell."""
-    u, v, w, channels = nodes.shape
-    corners = [nodes[a : u - 1 + a, b : v - 1 + b, c : w - 1 + c] for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-    return jnp.moveaxis(jnp.stack(corners, axis=-1), 3, 0).reshape(channels, -1, 8)
+        at = tuple(c * n for c, n in zip(((u + 1) / 2, (v + 1) / 2, w), self.grid.cells, strict=True))
+        return self.grid.interpolate(at, inside)
 
 
 class DepthVisibility(AbstractVisibility):
@@ -132,7 +111,7 @@ def depth_visibility(
             grids.append(None)
             continue
         clear = jnp.exp(-depth_nodes(space, scene, medium, texels, layers, samples))
-        grids.append(ClearGrid(space, cells_of(clear), texels, layers))
+        grids.append(ClearGrid(space, grid_of(clear)))
     return DepthVisibility(scene.volume.world_from_grid, tuple(grids))
 
 

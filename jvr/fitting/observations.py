@@ -16,7 +16,7 @@ from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import Seen, enter, step_length
-from jvr.rendering.medium import medium, occupancy, visibility
+from jvr.rendering.medium import medium, natural, occupancy, visibility
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
 from jvr.types import Triple
@@ -151,7 +151,7 @@ def keep_samples(
 def seen_in_fit(scene: Scene, settings: Settings) -> Seen:
     """What is computed once for all rays. Without a bound on what is negligible, derivatives would not leap over anything."""
     where = occupancy(scene, settings) if settings.negligible else None
-    return Seen(where, visibility(scene, where))
+    return Seen(where, visibility(scene, where), natural(scene))
 
 
 def observed_medium(scene: Scene, piece: Observations, samples: Samples | None, settings: Settings) -> tuple[Medium, Rays]:

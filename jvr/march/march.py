@@ -24,6 +24,9 @@ from jvr.types import Channels, Scalar
 
 # Leaps before a ray is started.
 FIRST_LEAPS = 4
+# Optical depth of a segment, and of a voxel on the way of light, beyond which denser media are lit alike: light gets about as deep into them
+# as the eye sees. Without it the two would be compared at distances that a position in single precision cannot tell apart.
+DENSEST = 64.0
 
 
 class AbstractField(eqx.Module):
@@ -40,7 +43,7 @@ class AbstractField(eqx.Module):
 
 
 class AbstractVisibility(eqx.Module):
-    """How much of each light reaches a point."""
+    """How much of each light reaches a point, and of that from all around where the scene asks for it."""
 
     @abc.abstractmethod
     def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
@@ -288,6 +291,13 @@ def resample(medium: Medium, sampled: list[Point], proof: Bool[Array, "rays"]) -
     return computed_once(proof, tuple(jax.vmap(medium.field.resample)(points) for points in sampled))
 
 
+def classify_at(medium: Medium, points: Point, proof: Bool[Array, "points"]) -> tuple[Classified, Sample]:
+    """Colour and extinction at a batch of points, and what the shader knows of them; `proof` as in `computed_once`."""
+    samples = computed_once(proof, jax.vmap(medium.field.resample)(points))
+    prepared = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, points)
+    return jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, prepared), prepared
+
+
 def lit(medium: Medium, where: Stretch, samples: tuple[Sample, ...], *, reverse: bool) -> tuple[Sample, ...]:
     """The samples of a segment with the light that reaches it, where that is asked for.
 
@@ -300,7 +310,7 @@ def lit(medium: Medium, where: Stretch, samples: tuple[Sample, ...], *, reverse:
     shader, middle = medium.shader, points_at(where.rays, where.ray, where.k, where.u)
     classify = lambda sample, point: shader.classify(medium.transfer, shader.prepare(medium.transfer, sample, point)).sigma_t
     sigma_t = [sigma for sample in samples for sigma in jax.vmap(classify)(sample, middle)]
-    dtau = sum(sigma_t[1:], sigma_t[0]) / len(sigma_t) * where.extent
+    dtau = jnp.minimum(sum(sigma_t[1:], sigma_t[0]) / len(sigma_t) * where.extent, DENSEST)
     points = points_at(where.rays, where.ray, where.k, where.u + where.extent * (mean_depth(dtau) - 0.5))
     # Without extinction there is nothing to see; but where nothing is left out it has a derivative, and between the ends of a segment
     # there may be what is at neither.

@@ -47,6 +47,16 @@ class OpticalShader(AbstractShader):
         return transfer.evaluate(sample.s, direction_and_length(sample.gradient)[1])
 
 
+class LightPathShader(OpticalShader):
+    """What light passes on its way to a point: extinction alone, and no more than `densest` of it (see `jvr.march.march.DENSEST`)."""
+
+    densest: Scalar
+
+    def classify(self, transfer: Any, sample: Sample) -> Classified:
+        rgb, sigma_t = super().classify(transfer, sample)
+        return Classified(rgb, tuple(jnp.minimum(sigma, self.densest) for sigma in sigma_t))
+
+
 class PreIntegratedShader(OpticalShader):
     """The optical model alone, the scalar linear along a segment."""
 

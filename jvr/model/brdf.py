@@ -8,37 +8,18 @@ A material function has two parts: `tinted` is multiplied with the colour of the
 light, as highlights of everything but metals do.
 """
 
-import abc
 import math
-from typing import ClassVar, Literal, TypeAlias
+from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import float_array, require
+from jvr.model.material import About, AbstractBRDF
 from jvr.model.phase import AbstractPhase, ScatteringAngle, components
 from jvr.numerics import direction_and_length, power_of_cosine
 from jvr.types import ArrayLike, Channels, Scalar, Triple
-
-# What a material function turns with: the normal alone, the direction to the eye alone, or both.
-About: TypeAlias = Literal["normal", "eye", "both"]
-
-
-class AbstractBRDF(eqx.Module):
-    """How a point of a surface, or of a medium, reflects."""
-
-    # "normal" where M depends on `w_i` and the normal alone, "eye" where on the angle between `w_o` and `w_i` alone.
-    about: ClassVar[About]
-
-    @abc.abstractmethod
-    def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
-        """`(tinted, plain)` of the material function, 1 / solid angle; each has no component, one, or three (RGB).
-
-        Elementwise over arrays that broadcast; differentiable in the directions and in every parameter. Glossy parts are 0 where
-        `w_o` lies below the surface.
-        """
 
 
 class LambertBRDF(AbstractBRDF):

@@ -61,11 +61,49 @@ class AbstractShadows(eqx.Module):
         return ()
 
 
+class AbstractMaterial(eqx.Module):
+    """How a point sends light from all directions to the eye."""
+
+    @property
+    @abc.abstractmethod
+    def needs_gradient(self) -> bool:
+        """Whether what is reflected depends on a normal."""
+
+    @abc.abstractmethod
+    def projected(self, order: int) -> Any:
+        """The same as a `jvr.HarmonicMaterial`, of this order unless it has been projected before."""
+
+
+class AbstractRadianceTransfer(eqx.Module):
+    """How the medium around a point changes the light that reaches it from all around."""
+
+    # Whether samples bring the light that reaches them, and not a share of all of it.
+    exact: eqx.AbstractVar[bool]
+
+    @property
+    @abc.abstractmethod
+    def needs_gradient(self) -> bool:
+        """Whether rays ask for gradients of what they pass."""
+
+    @property
+    @abc.abstractmethod
+    def is_frozen(self) -> bool:
+        """Whether it has been computed beforehand, so that it does not follow the transfer function."""
+
+    @abc.abstractmethod
+    def outdated(self, transfer: Any, material: AbstractMaterial | None) -> tuple[str, ...]:
+        """What has to be computed again for this transfer function and material, in a sentence; empty where nothing has."""
+
+    def coarser(self) -> tuple["AbstractRadianceTransfer", ...]:
+        """Cheaper ways to about the same light, one notch coarser."""
+        return ()
+
+
 def describe(part: Any) -> str:
     """A part of a scene with its static choices, such as `ShadowRays(step=1, termination=0.001)`; nothing for `None`."""
     if part is None:
         return ""
     fields = [f.name for f in dataclasses.fields(part) if f.metadata.get("static")]
-    chosen = ", ".join(f"{name}={getattr(part, name):g}" for name in fields if not isinstance(getattr(part, name), str))
+    chosen = ", ".join(f"{name}={getattr(part, name):g}" for name in fields if isinstance(getattr(part, name), int | float))
     inner = "".join(f", {type(x).__name__}" for x in vars(part).values() if isinstance(x, eqx.Module))
     return f"{type(part).__name__}({(chosen + inner).removeprefix(', ')})"

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jvr.model.brdf import About, AbstractBRDF, above, of_one_shape, where_or_normal
+from jvr.model.brdf import above, of_one_shape, where_or_normal
 from jvr.model.checks import float_array, require
+from jvr.model.material import About, AbstractBRDF
 from jvr.numerics import direction_and_length, dot
 from jvr.types import ArrayLike, Channels, Triple
 

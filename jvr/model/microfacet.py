@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.model.brdf import About, AbstractBRDF, above, of_one_shape, share, where_or_normal
+from jvr.model.brdf import above, of_one_shape, share, where_or_normal
 from jvr.model.checks import float_array, require
+from jvr.model.material import About, AbstractBRDF
 from jvr.model.phase import components
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import ArrayLike, Channels, Scalar, Triple

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import equinox as eqx
 
 from jvr.model.checks import float_array
-from jvr.model.effects import AbstractScattering, AbstractShading, AbstractShadows
+from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer, AbstractScattering, AbstractShading, AbstractShadows
+from jvr.model.environment import EnvironmentLight
 from jvr.model.light import AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
@@ -29,10 +30,15 @@ class Scene(eqx.Module):
     - `shadows`: how much of each light reaches a point: `jvr.ShadowRays`, `jvr.ShadowVolume`, `jvr.ShadowMap`, `jvr.OpacityShadowMap`,
       `jvr.DeepShadowMap`, or `None`: all of it.
     - `scattering`: what the medium makes of light: `jvr.SingleScattering` or `None`.
+    - `environment`: light from all around, far away: `jvr.EnvironmentLight` or `None`.
+    - `material`: what a point makes of the light from all around: a BRDF such as `jvr.MicrofacetBRDF(...)`, `jvr.HarmonicMaterial`,
+      `jvr.MaterialByValue`, or `None`.
+    - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
       `jvr.ForwardDifferences()`, `jvr.CentralDifferences()`, `jvr.SobelDifferences()`, `jvr.PrecomputedGradient()`.
 
-    **Raises** `ValueError` for shadows without a light, or with nothing that shows light.
+    **Raises** `ValueError` for shadows without a light, or with nothing that shows light; for one of environment and material without
+    the other, and for radiance transfer without both.
     """
 
     volume: Volume
@@ -45,6 +51,9 @@ class Scene(eqx.Module):
     shadows: AbstractShadows | None
     scattering: AbstractScattering | None
     normals: AbstractNormals
+    environment: EnvironmentLight | None
+    material: AbstractMaterial | None
+    radiance_transfer: AbstractRadianceTransfer | None
 
     def __init__(
         self,
@@ -59,6 +68,9 @@ class Scene(eqx.Module):
         shadows: AbstractShadows | None = None,
         scattering: AbstractScattering | None = None,
         normals: AbstractNormals = AnalyticGradient(),
+        environment: EnvironmentLight | None = None,
+        material: AbstractMaterial | None = None,
+        radiance_transfer: AbstractRadianceTransfer | None = None,
     ):
         self.volume = volume
         self.transfer = transfer
@@ -70,12 +82,24 @@ class Scene(eqx.Module):
         self.shadows = shadows
         self.scattering = scattering
         self.normals = normals
+        self.environment = environment
+        self.material = material
+        self.radiance_transfer = radiance_transfer
         _check_light(self)
+        _check_environment(self)
 
 
 def _check_light(scene: Scene) -> None:
     """Parts of the light that go together, each of its kind."""
-    kinds = {"shading": AbstractShading, "shadows": AbstractShadows, "scattering": AbstractScattering, "normals": AbstractNormals}
+    kinds = {
+        "shading": AbstractShading,
+        "shadows": AbstractShadows,
+        "scattering": AbstractScattering,
+        "normals": AbstractNormals,
+        "environment": EnvironmentLight,
+        "material": AbstractMaterial,
+        "radiance_transfer": AbstractRadianceTransfer,
+    }
     for name, kind in kinds.items():
         part = getattr(scene, name)
         if part is not None and not isinstance(part, kind):
@@ -89,3 +113,13 @@ def _check_light(scene: Scene) -> None:
         )
     if scene.shadows is not None and scene.shading is None and scene.scattering is None:
         raise ValueError("nothing shows these shadows: set shading=jvr.Lambert() or scattering=jvr.SingleScattering()")
+
+
+def _check_environment(scene: Scene) -> None:
+    """Light from all around, and what shows it."""
+    if scene.environment is not None and scene.material is None:
+        raise ValueError("nothing shows the environment: set material=jvr.LambertBRDF() or another material")
+    if scene.material is not None and scene.environment is None:
+        raise ValueError("a material shows light from all around: set environment=jvr.EnvironmentLight.from_image(...)")
+    if scene.radiance_transfer is not None and scene.environment is None:
+        raise ValueError("radiance transfer is that of an environment: set environment= and material=, or leave it out")

@@ -21,6 +21,7 @@ from jvr.model.transfer import LinearTransfer, LutTransfer
 from jvr.model.volume import Trilinear
 from jvr.numerics import divide_or_zero
 from jvr.rendering.image import Rendering, RenderStats, composite, enter, one_precision, step_length
+from jvr.rendering.medium import is_lit
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Slices, SliceStats
 from jvr.rendering.settings import Settings
@@ -85,7 +86,7 @@ def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
     if not isinstance(scene.volume.interpolation, Trilinear):
         name = type(scene.volume.interpolation).__name__
         raise ValueError(f"jvr.Slices() interpolates between samples, which {name}() volumes do not allow: {UNIFORM}")
-    if scene.shading is not None or scene.scattering is not None:
+    if is_lit(scene):
         raise ValueError(f"jvr.Slices() does not know light: {UNIFORM}, or take shading and scattering out of the scene")
     if not isinstance(settings.adjoint, Replay):
         raise ValueError(

@@ -116,6 +116,14 @@ def effects_of(scene: Scene) -> Iterator[tuple[str, Change]]:
     if isinstance(scene.transfer, GradientOpacity):
         inner = scene.transfer.transfer
         yield "gradient opacity", lambda s, settings: (dataclasses.replace(s, transfer=inner), settings)
+    if scene.radiance_transfer is not None:
+        yield (
+            f"radiance transfer {describe(scene.radiance_transfer)}",
+            lambda s, x: (dataclasses.replace(s, radiance_transfer=None), x),
+        )
+    if scene.environment is not None:
+        none = {"environment": None, "material": None, "radiance_transfer": None}
+        yield f"environment and material {describe(scene.material)}", lambda s, x: (dataclasses.replace(s, **none), x)
     for i, light in enumerate(scene.lights if lit and len(scene.lights) > 1 else ()):
         keep = lambda s, settings, light=light: (_without(s, lights=tuple(x for x in s.lights if x is not light)), settings)
         yield f"lights[{i}] {type(light).__name__}", keep
@@ -135,6 +143,12 @@ def _coarser(scene: Scene, settings: Settings) -> Iterator[tuple[str, Change]]:
     if scene.shadows is not None:
         for coarser in scene.shadows.coarser():
             yield f"shadows = {describe(coarser)}", lambda s, x, new=coarser: (dataclasses.replace(s, shadows=new), x)
+    if scene.radiance_transfer is not None:
+        for coarser in scene.radiance_transfer.coarser():
+            yield (
+                f"radiance transfer = {describe(coarser)}",
+                lambda s, x, new=coarser: (dataclasses.replace(s, radiance_transfer=new), x),
+            )
     if type(scene.normals) is not AnalyticGradient:
         analytic = AnalyticGradient(scene.normals.of_opacity)
         yield f"normals = {describe(analytic)}", lambda s, x: (dataclasses.replace(s, normals=analytic), x)
@@ -214,6 +228,10 @@ def remarks_on(scene: Scene, shadow_stats: Any) -> Iterator[str]:
         yield "scattering.albedo is zero everywhere: nothing is scattered"
     if scene.shading is not None and all(_is_zero(getattr(scene.shading, k, 0.0)) for k in ("diffuse", "specular")):
         yield "shading.diffuse and shading.specular are zero: nothing but ambient light is reflected"
+    if scene.environment is not None and not np.any(np.asarray(scene.environment.coefficients)):
+        yield "environment has no strength: it is computed and adds nothing"
+    if scene.radiance_transfer is not None:
+        yield from scene.radiance_transfer.outdated(scene.transfer, scene.material)
     if shadow_stats is not None and float(shadow_stats.overflow) > 0:
         share, error = float(shadow_stats.overflow), float(shadow_stats.error)
         yield f"{share:.0%} of the rays of a deep shadow map ran out of layers (error {error:.2g}): give it more"

@@ -1,6 +1,7 @@
 """`jvr.render`: a scene seen by a camera."""
 
 import functools
+import warnings
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
-from jvr.rendering.medium import medium, occupancy, visibility
+from jvr.rendering.medium import medium, natural, occupancy, visibility
 from jvr.rendering.parts import in_parts, is_traced
 from jvr.rendering.sampling import RefinementStats, SliceStats
 from jvr.rendering.settings import Settings
@@ -70,6 +71,9 @@ def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> 
         march = _render_pixels if pixels.size <= settings.tile else _render_tiles
         rgb, alpha, depth, steps = march(scene, camera, settings, where, pixels)
     else:
+        if scene.radiance_transfer is not None:
+            for problem in scene.radiance_transfer.outdated(scene.transfer, scene.material):
+                warnings.warn(problem, RuntimeWarning, stacklevel=3)
         where = _compiled_seen(scene, settings)
         part = functools.partial(_compiled_pixels, scene, camera, settings, where)
         rgb, alpha, depth, steps = in_parts(part, camera.height, camera.width, settings.tile)
@@ -79,10 +83,12 @@ def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> 
 
 
 class Seen(NamedTuple):
-    """What is computed once for all rays of a picture: visible bricks, and what shades the lights; `None` for neither."""
+    """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under light from
+    all around; each `None` where the scene asks for none."""
 
     occupancy: Occupancy | None = None
     shadows: AbstractVisibility | None = None
+    natural: Any = None
 
     @property
     def shadow_stats(self) -> Any:
@@ -93,7 +99,7 @@ def seen(scene: Scene, settings: Settings) -> Seen:
     """What rays through a scene need to know beforehand."""
     (scene,) = one_precision(scene)
     where = occupancy(scene, settings)
-    return Seen(where, visibility(scene, where))
+    return Seen(where, visibility(scene, where), natural(scene))
 
 
 def trace(

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from jvr.march.fields import VoxelField
-from jvr.march.march import AbstractShader, AbstractVisibility, Medium
+from jvr.march.march import DENSEST, AbstractShader, AbstractVisibility, Medium
 from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.quadrature import PreIntegrated
-from jvr.march.shaders import GradientFrame, OpticalShader, PreIntegratedShader
+from jvr.march.shaders import GradientFrame, LightPathShader, OpticalShader, PreIntegratedShader
 from jvr.model.bricks import bricks_of
 from jvr.model.light import AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals
@@ -25,17 +25,21 @@ from jvr.rendering.settings import Settings
 
 
 def medium(
-    scene: Scene, settings: Settings, occupancy: Occupancy | None = None, shadows: AbstractVisibility | None = None
+    scene: Scene,
+    settings: Settings,
+    occupancy: Occupancy | None = None,
+    shadows: AbstractVisibility | None = None,
+    natural: Any = None,
 ) -> Medium:
-    """What of a scene rays march through: what the scene does not name is not in it."""
+    """What of a scene rays march through: what the scene does not name is not in it. The last three are those of `Seen`."""
     frame, normals = _gradients(scene)
     field = VoxelField(scene.volume, normals)
     quadrature = settings.quadrature
     pre_integrated = isinstance(quadrature, PreIntegrated)
-    if scene.shading is None and scene.scattering is None:
-        shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
+    if is_lit(scene):
+        shader = _lit_shader(scene, frame, pre_integrated, natural)
     else:
-        shader = _lit_shader(scene, frame, pre_integrated)
+        shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
     if not isinstance(quadrature, PreIntegrated):
         return Medium(field, scene.transfer, shader, occupancy, shadows)
     # Checks the transfer function's type itself.
@@ -43,13 +47,18 @@ def medium(
     return Medium(field, table, shader, occupancy, shadows)
 
 
-def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool) -> AbstractShader:
+def is_lit(scene: Scene) -> bool:
+    """Whether anything in a scene shows light."""
+    return scene.shading is not None or scene.scattering is not None or scene.material is not None
+
+
+def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool, natural: Any) -> AbstractShader:
     from jvr.effects.lighting import LitPreIntegratedShader, LitShader
 
     kind = LitPreIntegratedShader if pre_integrated else LitShader
     ambient = tuple(light for light in scene.lights if isinstance(light, AmbientLight))
     lights, volume = arriving_lights(scene), scene.volume
-    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering)
+    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering, natural)
 
 
 def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
@@ -64,7 +73,8 @@ def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | No
 
 def needs_gradient(scene: Scene) -> bool:
     """Whether anything in a scene asks for gradients."""
-    return scene.shading is not None or scatters_by_gradient(scene) or scene.transfer.takes_gradient
+    asks = scene.shading is not None or scatters_by_gradient(scene) or scene.transfer.takes_gradient
+    return asks or (scene.material is not None and scene.material.needs_gradient)
 
 
 def scatters_by_gradient(scene: Scene) -> bool:
@@ -78,12 +88,35 @@ def arriving_lights(scene: Scene) -> tuple[AbstractLight, ...]:
 
 
 def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility | None:
-    """What says how much light reaches a point, or `None` where nothing casts shadows. Made once for a picture."""
-    if scene.shadows is None:
+    """What says how much light reaches a point, or `None` where nothing is in its way. Made once for a picture."""
+    if scene.shadows is None and scene.radiance_transfer is None:
         return None
-    frame, normals = _gradients(scene) if scene.transfer.takes_gradient else (None, None)
-    absorbing = Medium(VoxelField(scene.volume, normals), scene.transfer, OpticalShader(AbsorptionOnly(), frame), occupancy)
-    return scene.shadows.prepared(scene, arriving_lights(scene), absorbing, jnp.min(scene.volume.spacing))
+    shadows = None
+    if scene.shadows is not None:
+        medium = absorbing(scene, occupancy, scene.transfer.takes_gradient)
+        shadows = scene.shadows.prepared(scene, arriving_lights(scene), medium, jnp.min(scene.volume.spacing))
+    if scene.radiance_transfer is None:
+        return shadows
+    from jvr.effects.transfer_grid import transfer_visibility
+
+    medium = absorbing(scene, occupancy, scene.transfer.takes_gradient or scene.radiance_transfer.needs_gradient)
+    return transfer_visibility(scene, medium, shadows, len(arriving_lights(scene)))
+
+
+def absorbing(scene: Scene, occupancy: Occupancy | None, graded: bool) -> Medium:
+    """What light passes on its way to a point, with gradients where it is `graded`."""
+    frame, normals = _gradients(scene) if graded else (None, None)
+    shader = LightPathShader(AbsorptionOnly(), frame, DENSEST / jnp.min(scene.volume.spacing))
+    return Medium(VoxelField(scene.volume, normals), scene.transfer, shader, occupancy)
+
+
+def natural(scene: Scene) -> Any:
+    """The material under light from all around, or `None` without one. Made once for a picture."""
+    if scene.material is None:
+        return None
+    from jvr.effects.natural_light import natural_light_of
+
+    return natural_light_of(scene)
 
 
 def occupancy(scene: Scene, settings: Settings) -> Occupancy | None:

@@ -90,17 +90,22 @@ def plan(scene: Scene, settings: Settings = Settings()) -> Plan:
 def _light_parts(scene: Scene) -> tuple[Part, ...]:
     """Everything about light: each part is in because the scene holds it, or, as gradients, because another part asks."""
     shading, shadows, scattering, none = scene.shading, scene.shadows, scene.scattering, "the scene names none"
-    lit = shading is not None or scattering is not None
     lights = sorted(scene.lights, key=lambda light: isinstance(light, AmbientLight))
-    shown = ", ".join(type(light).__name__ for light in lights) + ("" if lit else ": nothing reflects or scatters them")
-    asks = {"shading": shading is not None, "scattering": scatters_by_gradient(scene), "transfer": scene.transfer.takes_gradient}
+    shows = shading is not None or scattering is not None
+    shown = ", ".join(type(light).__name__ for light in lights) + ("" if shows else ": nothing reflects or scatters them")
+    asks = {
+        "shading": shading is not None,
+        "scattering": scatters_by_gradient(scene),
+        "material": scene.material is not None and scene.material.needs_gradient,
+        "transfer": scene.transfer.takes_gradient,
+    }
     asking = " and ".join(name for name, there in asks.items() if there)
     gradient = f"{describe(scene.normals)}, asked for by {asking}" if asking else "nothing asks for a gradient"
     casting = sum(light.casts_shadows for light in arriving_lights(scene))
     shaded = none if shadows is None else f"{describe(shadows)} for {casting} light{'s' * (casting != 1)}"
     by_gradient = ("lights", "gradient")
     return (
-        Part("lights", lit and bool(lights), shown if lights else none),
+        Part("lights", shows and bool(lights), shown if lights else none),
         Part("shading", shading is not None, describe(shading) or none, by_gradient if shading is not None else ()),
         Part("shadows", shadows is not None, shaded, ("light march",) if shadows is not None else ()),
         Part(
@@ -109,5 +114,25 @@ def _light_parts(scene: Scene) -> tuple[Part, ...]:
             describe(scattering) or none,
             by_gradient[: 1 + asks["scattering"]] if scattering else (),
         ),
+        *_environment_parts(scene),
         Part("gradient", bool(asking), gradient),
+    )
+
+
+def _environment_parts(scene: Scene) -> tuple[Part, ...]:
+    """Light from all around, the material that shows it, and what is in its way."""
+    environment, material, transfer, none = scene.environment, scene.material, scene.radiance_transfer, "the scene names none"
+    around = none if environment is None else f"light from all around, {len(environment.coefficients)} coefficients"
+    needs = ("environment", "gradient") if material is not None and material.needs_gradient else ("environment",)
+    shown = none if material is None else describe(material)
+    made = "" if transfer is None else "computed beforehand" if transfer.is_frozen else "computed in each picture: jvr.precompute"
+    return (
+        Part("environment", environment is not None, around),
+        Part("material", material is not None, shown, needs if material is not None else ()),
+        Part(
+            "radiance transfer",
+            transfer is not None,
+            f"{describe(transfer)}, {made}" if transfer is not None else none,
+            ("environment", "light march") if transfer is not None else (),
+        ),
     )

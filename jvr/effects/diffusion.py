@@ -1,0 +1,73 @@
+"""The scattering pass: light that the medium spreads over a neighbourhood (Lindemann and Ropinski 2010, section 4.2)."""
+
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jvr.model.dipole import Dipole
+from jvr.model.volume import Volume
+
+# Places in a node's cell, along each axis, over which the kernel is averaged: it may be narrower than a cell.
+PLACES = 4
+
+
+def scatter(
+    dipole: Dipole,
+    radius: float,
+    volume: Volume,
+    coefficients: Float[Array, "x y z channels bands"],
+    opened: Float[Array, "x y z"],
+) -> tuple[Float[Array, "x y z 3 bands"], Float[Array, "x y z"]]:
+    """What every node receives after scattering, in each colour, and `open` spread alike.
+
+        L'(x) = R sum_i R_d(|x - x_i|) L(x_i) / sum_i R_d(|x - x_i|)
+
+    over the nodes `x_i` of the medium (`open > 0`) in a neighbourhood, with the dipole's diffuse reflectance `R_d` and its total `R`.
+    The paper's equation (4) divides by the number of neighbours instead, which leaves the scale of the picture to the units of `R_d`.
+
+    **Arguments:** `radius`: of the neighbourhood, as a share of the volume's longest side. By FFT, so that the time hardly depends on it.
+    Differentiable in everything.
+    """
+    kernel = kernel_of(dipole, radius, volume, opened.shape)
+    there = (opened > 0).astype(opened.dtype)
+    spread = lambda field, k: _convolved(field * there, k)
+    weight = jax.vmap(lambda k: spread(there, k))(kernel)
+    # What FFT leaves of zero is rounding; a node of the medium has at least itself.
+    safe = jnp.where(there > 0, weight, 1.0)
+    mean = lambda field, c: jnp.where(there > 0, spread(field, kernel[c]) / safe[c], 0.0)
+    total, channels = dipole.total, coefficients.shape[3]
+
+    def band(values: Float[Array, "x y z channels"]) -> Float[Array, "x y z 3"]:
+        return jnp.stack([total[c] * mean(values[..., c % channels], c) for c in range(3)], axis=-1)
+
+    scattered = jax.lax.map(band, jnp.moveaxis(coefficients, -1, 0))
+    return jnp.moveaxis(scattered, 0, -1), jnp.mean(jnp.stack([mean(opened, c) for c in range(3)]), axis=0)
+
+
+def kernel_of(dipole: Dipole, radius: float, volume: Volume, shape: tuple[int, ...]) -> Float[Array, "3 x y z"]:
+    """`R_d` averaged over the cells of the nodes around a node, in each colour; zero beyond the radius."""
+    steps = [(n - 1) / (m - 1) if m > 1 else 1.0 for n, m in zip(volume.shape, shape, strict=True)]
+    longest = max(n - 1 for n in volume.shape)
+    reach = [min(math.ceil(radius * longest / step), m - 1) if m > 1 else 0 for step, m in zip(steps, shape, strict=True)]
+    offsets = np.stack(np.meshgrid(*[np.arange(-r, r + 1) for r in reach], indexing="ij"), axis=-1)
+    axes = volume.world_from_grid[:3, :3] * jnp.asarray(steps)
+    length = lambda offset: jnp.linalg.norm(offset @ axes.T, axis=-1)
+    inside = length(jnp.asarray(offsets, axes.dtype)) <= radius * longest * jnp.max(volume.spacing)
+    fractions = (np.arange(PLACES) + 0.5) / PLACES - 0.5
+    total = jnp.zeros((3, *offsets.shape[:3]), axes.dtype)
+    for fraction in itertools.product(fractions, repeat=3):
+        total += jnp.stack(dipole.reflectance(length(jnp.asarray(offsets + np.array(fraction), axes.dtype))))
+    return jnp.where(inside, total / PLACES**3, 0.0)
+
+
+def _convolved(field: Float[Array, "x y z"], kernel: Float[Array, "i j k"]) -> Float[Array, "x y z"]:
+    """The sum over neighbours, by FFT of both with room for what would wrap around."""
+    size = [n + m - 1 for n, m in zip(field.shape, kernel.shape, strict=True)]
+    both = jnp.fft.rfftn(field, size) * jnp.fft.rfftn(kernel, size)
+    whole = jnp.fft.irfftn(both, size)
+    begin = [m // 2 for m in kernel.shape]
+    return whole[tuple(slice(b, b + n) for b, n in zip(begin, field.shape, strict=True))].astype(field.dtype)

@@ -1,0 +1,386 @@
+"""Radiance transfer: how much of the light from each direction reaches a point through the medium around it (Lindemann and Ropinski 2010,
+sections 4 and 4.1), projected on spherical harmonics at the nodes of a coarse grid and interpolated between them.
+"""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jvr.effects.natural_light import NaturalLight
+from jvr.effects.shading import share_of
+from jvr.march.march import Medium, classify_at
+from jvr.march.steps import Point
+from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer
+from jvr.model.harmonics.basis import basis, count
+from jvr.model.light import perpendicular
+from jvr.model.transfer import AbstractTransfer
+from jvr.model.volume import ClippingBox, Volume
+from jvr.numerics import direction_and_length, ray_box
+from jvr.types import Channels, Scalar, Triple
+
+# Nodes that are projected together in one program.
+CHUNK = 256
+# Azimuth between one direction and the next, the golden angle.
+GOLDEN = math.pi * (3 - math.sqrt(5))
+
+
+class TransferBleeding(eqx.Module):
+    """Rays pick up the transfer function's colour of what they pass: materials may be exchanged without a new projection."""
+
+
+class MaterialBleeding(eqx.Module):
+    """Rays pick up what the material reflects towards their origin, times the transfer function's colour where that tints it: a new
+    material needs a new projection."""
+
+
+class ProjectedTransfer(eqx.Module):
+    """Radiance transfer as it was projected, for the transfer function of that time.
+
+    - `luminance`: `(x, y, z, 1, bands)` for a transfer without colour, else `(x, y, z, 3, bands)`, or the luma alone where
+    - `chroma`: `(x, y, z, 2, fewer bands)` holds orange-blue and green-purple differences (YCoCg); else `None`.
+    - `open`: `(x, y, z)`, the share of the sphere that rays were sent into, `(1 + sin alpha) / 2`.
+    - `made_for`: the numbers of the transfer function, and of the material where that is part of it.
+    - `scattered`: whether the scattering pass has been made.
+    """
+
+    luminance: Float[Array, "x y z channels bands"]
+    chroma: Float[Array, "x y z 2 fewer"] | None
+    open: Float[Array, "x y z"]
+    made_for: Float[Array, "numbers"]
+    scattered: bool = eqx.field(static=True, default=False)
+
+    @property
+    def coefficients(self) -> Float[Array, "x y z channels bands"]:
+        """Coefficients of each colour, or of all of them in one channel."""
+        if self.chroma is None:
+            return self.luminance
+        luma = self.luminance[..., 0, :]
+        missing = luma.shape[-1] - self.chroma.shape[-1]
+        orange, green = jnp.moveaxis(jnp.pad(self.chroma, ((0, 0),) * 4 + ((0, missing),)), 3, 0)
+        return jnp.stack([luma + orange - green, luma + green, luma - orange - green], axis=3)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the coefficients."""
+        return sum(x.size * x.dtype.itemsize for x in (self.luminance, self.chroma, self.open) if x is not None)
+
+
+class RadianceTransfer(AbstractRadianceTransfer):
+    """Shadows, colour bleeding and scattering of light that comes from all around (`Scene(environment=...)`).
+
+    At each node rays are sent into the part of the sphere that is not below a surface: with the transparency `tau` of a node's width of
+    medium and the change `m` of it from one node to the next, the below-surface angle is
+
+        alpha = pi / 2 (1 - (1 - tau) m^2 / (m^2 + surface^2)),
+
+    and directions within `pi / 2 + alpha` of the gradient of `tau` are drawn with density `1 / (2 pi (1 + sin alpha))`, `rays` of them
+    on a spiral of equal areas. What they carry is projected on harmonics.
+
+    **Arguments:**
+
+    - `order`: of the harmonics, 0 to 10.
+    - `rays`: for each node.
+    - `resolution`: nodes for each voxel along an axis, above 0 and at most 1. Nodes near which nothing is visible are left out.
+    - `bleeding`: `None` (rays carry visibility), `TransferBleeding()` or `MaterialBleeding()` (front-to-back colour, and what remains of
+      white light behind it).
+    - `scattering`: `jvr.Dipole(...)` or `None`: each node gets the mean of what its neighbours receive, weighted with the dipole's diffuse
+      reflectance; `neighbourhood`: its radius, as a share of the volume's longest side.
+    - `exact`: the triple product of material, light and transfer, instead of the paper's two double products (which a mean of the light
+      over the part of the sphere that rays are sent into makes exact for light that is the same from everywhere).
+    - `chromaticity`: `None`, or the order to keep colour differences at, where rays carry colour; luminance keeps `order`.
+    - `step`, `growth`: first step in voxels, and the ratio of a step to the one before; `termination`: a ray ends once its transmittance
+      is at most this.
+    - `start`: length in voxels that rays leave out at their beginning, so that nodes below a surface do not darken the samples on it;
+      what is thinner casts no shadow.
+    - `surface`: see above.
+    - `memory`: bytes that the coefficients may take.
+
+    Differentiable in transfer function, voxels, material and scattering while it is not projected; then each picture does it anew.
+    `jvr.precompute(scene)` does it once and keeps the result, which is then a constant: camera and light may change, the transfer
+    function should not. **Raises** `ValueError` for numbers outside their ranges.
+    """
+
+    order: int = eqx.field(static=True)
+    rays: int = eqx.field(static=True)
+    resolution: float = eqx.field(static=True)
+    bleeding: TransferBleeding | MaterialBleeding | None
+    scattering: Any
+    neighbourhood: float = eqx.field(static=True)
+    exact: bool = eqx.field(static=True)
+    chromaticity: int | None = eqx.field(static=True)
+    step: float = eqx.field(static=True)
+    growth: float = eqx.field(static=True)
+    start: float = eqx.field(static=True)
+    termination: float = eqx.field(static=True)
+    surface: float = eqx.field(static=True)
+    memory: float = eqx.field(static=True)
+    projected: ProjectedTransfer | None
+
+    def __init__(
+        self,
+        order: int = 3,
+        rays: int = 64,
+        resolution: float = 1 / 3,
+        *,
+        bleeding: TransferBleeding | MaterialBleeding | None = None,
+        scattering: Any = None,
+        neighbourhood: float = 0.1,
+        exact: bool = False,
+        chromaticity: int | None = None,
+        step: float = 1.0,
+        growth: float = 1.1,
+        start: float = 3.0,
+        termination: float = 0.05,
+        surface: float = 0.1,
+        memory: float = 2e9,
+    ):
+        wrong = {
+            "order must be a whole number from 0 to 10": not isinstance(order, int) or not 0 <= order <= 10,
+            "rays must be a whole number of at least 1": not isinstance(rays, int) or rays < 1,
+            "resolution must be above 0 and at most 1 nodes for each voxel": not 0 < resolution <= 1,
+            "neighbourhood must be above 0 and at most 1 of the longest side": not 0 < neighbourhood <= 1,
+            "step must be above 0 and growth at least 1": not (step > 0 and growth >= 1),
+            "start must not be negative": not start >= 0,
+            "termination must be a transmittance in [0, 1)": not 0 <= termination < 1,
+            "surface must be a positive change of transparency": not surface > 0,
+            "chromaticity must be None or an order up to that of the luminance, and needs bleeding": chromaticity is not None
+            and (bleeding is None or not 0 <= chromaticity <= order),
+        }
+        for message, is_wrong in wrong.items():
+            if is_wrong:
+                raise ValueError(f"{message}; see the docstring of RadianceTransfer for what the defaults are")
+        self.order, self.rays, self.exact, self.chromaticity = order, rays, bool(exact), chromaticity
+        self.resolution, self.neighbourhood, self.memory = float(resolution), float(neighbourhood), float(memory)
+        self.step, self.growth, self.start = float(step), float(growth), float(start)
+        self.termination, self.surface = float(termination), float(surface)
+        self.bleeding, self.scattering, self.projected = bleeding, scattering, None
+
+    def outdated(self, transfer: AbstractTransfer, material: AbstractMaterial | None) -> tuple[str, ...]:
+        if self.projected is None:
+            return ()
+        now, then = self.made_for(transfer, material), self.projected.made_for
+        if now.shape == then.shape and np.allclose(np.asarray(now), np.asarray(then), rtol=1e-6, atol=0):
+            return ()
+        what = "transfer function or material" if self.needs_gradient else "transfer function"
+        return (
+            f"the radiance transfer was computed for another {what}: call jvr.precompute with a scene that has not been through it",
+        )
+
+    def coarser(self) -> tuple[AbstractRadianceTransfer, ...]:
+        # Of what has been computed beforehand nothing can be saved but the exact product.
+        if self.exact:
+            return (_changed(self, exact=False),)
+        return (
+            ()
+            if self.is_frozen
+            else (_changed(self, resolution=self.resolution / 2), _changed(self, rays=max(self.rays // 2, 1)))
+        )
+
+    def with_projected(self, projected: ProjectedTransfer) -> "RadianceTransfer":
+        """The same, computed beforehand."""
+        return eqx.tree_at(lambda t: t.projected, self, projected, is_leaf=lambda x: x is None)
+
+    @property
+    def needs_gradient(self) -> bool:
+        return isinstance(self.bleeding, MaterialBleeding)
+
+    @property
+    def is_frozen(self) -> bool:
+        return self.projected is not None
+
+    def shape(self, volume: Volume) -> tuple[int, int, int]:
+        """Nodes along each axis. **Raises** `ValueError` where their coefficients would exceed `memory`."""
+        x, y, z = (1 if n == 1 else max(2, math.ceil((n - 1) * self.resolution) + 1) for n in volume.shape)
+        channels = 1 if self.bleeding is None and self.scattering is None else 3
+        needed = 4 * x * y * z * (channels * count(self.order) + 1)
+        if needed > self.memory:
+            fits = self.resolution * (self.memory / needed) ** (1 / 3)
+            raise ValueError(
+                f"radiance transfer would take {needed / 1e9:.2g} GB, more than memory={self.memory:.2g} bytes: "
+                f"a resolution of {fits:.2f} fits, or raise memory"
+            )
+        return x, y, z
+
+    def made_for(self, transfer: AbstractTransfer, material: AbstractMaterial | None) -> Float[Array, "numbers"]:
+        """What a projection depends on apart from the volume, as numbers."""
+        parts = (transfer, material) if isinstance(self.bleeding, MaterialBleeding) else (transfer,)
+        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(parts)])
+
+    def boundaries(self, shape: tuple[int, int, int]) -> np.ndarray:
+        """Ends of the steps of a ray, as shares of the volume's diameter; the first is where it begins."""
+        across = max(math.sqrt(sum((n - 1) ** 2 for n in shape)), 1.0)
+        ends = [self.start]
+        while ends[-1] < across:
+            ends.append(ends[-1] + self.step * self.growth ** (len(ends) - 1))
+        return np.minimum(np.array(ends), across) / across
+
+
+def _changed(transfer: RadianceTransfer, **settings: Any) -> RadianceTransfer:
+    """The same with other settings."""
+    same = {f.name: getattr(transfer, f.name) for f in dataclasses.fields(transfer) if f.name != "projected"}
+    changed = RadianceTransfer(**(same | settings))
+    return changed if transfer.projected is None else changed.with_projected(transfer.projected)
+
+
+class Cone(NamedTuple):
+    """The part of the sphere that rays of a node are sent into: unit axis in the world, and `sin alpha`."""
+
+    axis: Triple
+    sine: Scalar
+
+
+def node_positions(volume: Volume, shape: tuple[int, int, int]) -> np.ndarray:
+    """Grid positions of the nodes, `(nodes, 3)`: equally distant, the first and the last at the border."""
+    axes = [np.linspace(0, n - 1, m) if n > 1 else np.zeros(1) for n, m in zip(volume.shape, shape, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+
+
+def project_nodes(
+    transfer: RadianceTransfer,
+    volume: Volume,
+    clipping: ClippingBox | None,
+    medium: Medium,
+    albedo: NaturalLight | None,
+    p: Float[Array, "nodes 3"],
+) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes"]]:
+    """Coefficients of the radiance transfer at grid positions, and `open` of `ProjectedTransfer`.
+
+    **Arguments:** `medium`: what rays pass; `albedo`: where they pick up the material's colour, that under light of one from everywhere.
+    """
+    nodes = tuple(p.T.astype(volume.slope.dtype))
+    cone = _cone(transfer, volume, medium, nodes)
+    directions = _spread(cone, transfer.rays)
+    wide = lambda c: jnp.broadcast_to(c[:, None], (c.shape[0], transfer.rays)).ravel()
+    along = tuple(d.ravel() for d in directions)
+    rays = _rays(volume, clipping, tuple(map(wide, nodes)), along)
+    carried = _carried(transfer, volume, medium, albedo, rays)
+    functions = jnp.stack(basis(transfer.order, directions), axis=-1)
+    # Each sample counts by the inverse of its density, 2 pi (1 + sin alpha).
+    weight = 2 * math.pi * (1 + cone.sine) / transfer.rays
+    values = jnp.stack([c.reshape(p.shape[0], transfer.rays) for c in carried], axis=1)
+    return jnp.einsum("ncr,nrb->ncb", values, functions) * weight[:, None, None], 0.5 * (1 + cone.sine)
+
+
+def _cone(transfer: RadianceTransfer, volume: Volume, medium: Medium, p: Triple) -> Cone:
+    """Where the rays of nodes go, from the transparency of a node's width of medium and its central differences."""
+    width = jnp.min(volume.spacing) / transfer.resolution
+    lower, upper = volume.domain
+    half = 0.5 / transfer.resolution
+
+    def transparency(p: Triple) -> Scalar:
+        p = tuple(jnp.clip(c, low, high) for c, low, high in zip(p, lower, upper, strict=True))
+        sigma_t = classify_at(medium, _points(p, p), jnp.ones(p[0].shape, bool))[0].sigma_t
+        return jnp.exp(-width * sum(sigma_t[1:], sigma_t[0]) / len(sigma_t))
+
+    differences = []
+    for axis, n in enumerate(volume.shape):
+        ends = [tuple(c + sign * half * (a == axis) for a, c in enumerate(p)) for sign in (-1, 1)]
+        span = jnp.clip(ends[1][axis], 0, n - 1) - jnp.clip(ends[0][axis], 0, n - 1)
+        change = transparency(ends[1]) - transparency(ends[0])
+        differences.append(jnp.where(span > 0, change / jnp.where(span > 0, span, 1.0), 0.0))
+    inverse = volume.axes_inverse
+    gradient = tuple(sum((inverse[j, i] * differences[j] for j in range(3)), jnp.zeros_like(p[0])) for i in range(3))
+    axis, length = direction_and_length(gradient)
+    flat = length == 0
+    axis = (axis[0], axis[1], jnp.where(flat, 1.0, axis[2]))
+    strength = (1 - transparency(p)) * share_of(length * width, jnp.asarray(transfer.surface, length.dtype))
+    return Cone(axis, jnp.sin(0.5 * math.pi * (1 - strength)))
+
+
+def _spread(cone: Cone, rays: int) -> Triple:
+    """Unit directions `(nodes, rays)`, on a spiral of equal areas about each cone's axis."""
+    index = jnp.arange(rays, dtype=cone.sine.dtype)
+    cosine = 1 - (1 + cone.sine[:, None]) * (index + 0.5) / rays
+    sine = jnp.sqrt(jnp.maximum((1 - cosine) * (1 + cosine), 0.0))
+    a, b = perpendicular(cone.axis)
+    u, v = sine * jnp.cos(GOLDEN * index), sine * jnp.sin(GOLDEN * index)
+    return tuple(u * a[i][:, None] + v * b[i][:, None] + cosine * cone.axis[i][:, None] for i in range(3))
+
+
+class _Rays(NamedTuple):
+    """Rays from nodes: grid position, direction in the world and in the grid, and the distances between which there is a medium."""
+
+    p: Triple
+    direction: Triple
+    along: Triple
+    t_in: Scalar
+    t_out: Scalar
+
+
+def _rays(volume: Volume, clipping: ClippingBox | None, p: Triple, direction: Triple) -> _Rays:
+    along = volume.grid_from_world(direction, direction=True)
+    t_in, t_out = ray_box(p, along, *volume.domain)
+    if clipping is not None:
+        near, far = ray_box(volume.world_from_point(p), direction, tuple(clipping.lower), tuple(clipping.upper))
+        t_in, t_out = jnp.maximum(t_in, near), jnp.minimum(t_out, far)
+    t_in = jnp.maximum(t_in, 0.0)
+    hit = t_out > t_in
+    return _Rays(p, direction, along, jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0))
+
+
+def _carried(transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo: NaturalLight | None, rays: _Rays) -> Channels:
+    """What rays carry from far away to grid positions: transmittance, or with bleeding white light behind the colours of what they pass."""
+    ends = jnp.asarray(transfer.boundaries(volume.shape), rays.t_out.dtype) * 2 * volume.radius
+    opaque = -math.log(transfer.termination) if transfer.termination > 0 else math.inf
+    lower, upper = volume.domain
+    toward_origin = tuple(-d for d in rays.direction)
+
+    def one_step(state: tuple[Channels, Channels], ends: tuple[Scalar, Scalar]) -> tuple[Channels, Channels]:
+        tau, colour = state
+        begin, end = (jnp.clip(e, rays.t_in, rays.t_out) for e in ends)
+        middle = 0.5 * (begin + end)
+        # By a rounding the middle may be outside, where nothing may be read.
+        at = tuple(jnp.clip(c + middle * d, a, b) for c, d, a, b in zip(rays.p, rays.along, lower, upper, strict=True))
+        inside = (end > begin) & (_least(tau) < opaque)
+        medium_there, sample = classify_at(medium, _points(at, rays.along), inside)
+        dtau = tuple(jnp.where(inside, sigma * (end - begin), 0.0) for sigma in medium_there.sigma_t)
+        if colour:
+            rgb = _colour(medium_there.rgb, sample, albedo, toward_origin)
+            before = [jnp.exp(-t) for t in tau] * (3 // len(tau))
+            thick = dtau * (3 // len(dtau))
+            colour = tuple(c - T * jnp.expm1(-d) * e for c, T, d, e in zip(colour, before, thick, rgb, strict=True))
+        return tuple(t + d for t, d in zip(tau, dtau, strict=True)), colour
+
+    # Checkpointed: the way back computes a step again rather than keep all of its voxels.
+    @jax.checkpoint
+    def step(state: tuple[Channels, Channels], ends: tuple[Scalar, Scalar]) -> tuple[tuple[Channels, Channels], None]:
+        alive = (ends[0] < rays.t_out) & (ends[1] > rays.t_in) & (_least(state[0]) < opaque)
+        return jax.lax.cond(jnp.any(alive), lambda s: one_step(s, ends), lambda s: s, state), None
+
+    zero = jnp.zeros_like(rays.t_out)
+    channels = len(jax.eval_shape(lambda: classify_at(medium, _points(rays.p, rays.along), zero > 0)[0].sigma_t))
+    state = ((zero,) * channels, () if transfer.bleeding is None else (zero,) * 3)
+    (tau, colour), _ = jax.lax.scan(step, state, (ends[:-1], ends[1:]))
+    clear = tuple(jnp.exp(-t) for t in tau)
+    return tuple(c + T for c, T in zip(colour, clear * (3 // channels), strict=True)) if colour else clear
+
+
+def _colour(rgb: Triple, sample: Any, albedo: NaturalLight | None, w_o: Triple) -> Triple:
+    """What a ray picks up of a sample: the colour of the transfer function, or what the material reflects of light from everywhere."""
+    if albedo is None:
+        return rgb
+
+    def one(s: Scalar, gradient: Triple, w_o: Triple) -> tuple[Triple, Triple]:
+        normal, magnitude = direction_and_length(tuple(-g for g in gradient))
+        return albedo.reflect(s, magnitude, normal, w_o, ())
+
+    tinted, plain = jax.vmap(one)(sample.s, sample.gradient, w_o)
+    return tuple(c * a + b for c, a, b in zip(rgb, tinted, plain, strict=True))
+
+
+def _least(tau: Channels) -> Scalar:
+    """Optical depth of the clearest channel."""
+    least = tau[0]
+    for t in tau[1:]:
+        least = jnp.minimum(least, t)
+    return least
+
+
+def _points(p: Triple, along: Triple) -> Point:
+    return Point(p, along, *(jnp.zeros_like(p[0], jnp.int32),) * 2)

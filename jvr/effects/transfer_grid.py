@@ -1,0 +1,199 @@
+"""Radiance transfer at every sample: projected at nodes, multiplied with the light there, interpolated."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jvr.effects.cells import AbstractGrid, grid_of
+from jvr.effects.natural_light import NaturalLight, natural_light
+from jvr.effects.radiance_transfer import (
+    CHUNK,
+    MaterialBleeding,
+    ProjectedTransfer,
+    RadianceTransfer,
+    node_positions,
+    project_nodes,
+)
+from jvr.march.march import AbstractVisibility, Medium
+from jvr.march.steps import Point
+from jvr.model.harmonics.algebra import product_matrix
+from jvr.model.harmonics.basis import count
+from jvr.model.scene import Scene
+from jvr.model.volume import ClippingBox, Volume
+from jvr.types import Channels
+
+
+class TransferVisibility(AbstractVisibility):
+    """What `inner` says of the scene's lights and, as one more light, of the environment: its share that arrives in each colour, or the
+    coefficients of what arrives, all colours of the first, then of the next."""
+
+    grid: AbstractGrid
+    scale: tuple[float, float, float] = eqx.field(static=True)
+    inner: AbstractVisibility | None
+    lights: int = eqx.field(static=True)
+
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
+        none = ((),) * self.lights
+        own = none if self.inner is None else self.inner.transmittances(points, wanted, reverse=reverse)
+        at = tuple(c * f for c, f in zip(points.p, self.scale, strict=True))
+        return (*own, self.grid.interpolate(at, wanted))
+
+    @property
+    def stats(self) -> Any:
+        return None if self.inner is None else self.inner.stats
+
+
+def transfer_visibility(scene: Scene, medium: Medium, inner: AbstractVisibility | None, lights: int) -> TransferVisibility:
+    """How much of the environment reaches each sample of a scene.
+
+    **Arguments:** `medium`: what rays pass; `lights`: how many others `inner` knows.
+    """
+    transfer, environment = transfer_of(scene), scene.environment
+    assert environment is not None
+    assert scene.material is not None
+    material = scene.material
+    projected = transfer.projected
+    if projected is None:
+        projected = finished(scene, *project_all(TransferProjection.of(scene, medium)))
+    elif transfer.scattering is not None and not projected.scattered:
+        projected = scattered(scene, projected)
+    coefficients, light = projected.coefficients, environment.coefficients
+    if transfer.exact:
+        arriving = _products(coefficients, light, material.projected(environment.order).order)
+    else:
+        arriving = _shares(projected, coefficients, light)
+    shape = coefficients.shape[:3]
+    x, y, z = ((m - 1) / (n - 1) if n > 1 else 0.0 for n, m in zip(scene.volume.shape, shape, strict=True))
+    return TransferVisibility(grid_of(arriving), (x, y, z), inner, lights)
+
+
+def transfer_of(scene: Scene) -> RadianceTransfer:
+    """The radiance transfer of a scene that has one."""
+    assert isinstance(scene.radiance_transfer, RadianceTransfer)
+    return scene.radiance_transfer
+
+
+class TransferProjection(eqx.Module):
+    """All that the nodes of a scene are projected with. `albedo`: what a material reflects of light of one from everywhere, where rays
+    pick that up."""
+
+    transfer: RadianceTransfer
+    volume: Volume
+    clipping: ClippingBox | None
+    medium: Medium
+    albedo: NaturalLight | None
+
+    @classmethod
+    def of(cls, scene: Scene, medium: Medium) -> "TransferProjection":
+        """`medium`: what the scene's rays of light pass."""
+        transfer, albedo = transfer_of(scene), None
+        if isinstance(transfer.bleeding, MaterialBleeding):
+            assert scene.material is not None
+            everywhere = jnp.full((1, 3), math.sqrt(4 * math.pi), scene.volume.slope.dtype)
+            albedo = natural_light(scene.material.projected(0), everywhere, clamped=True, order=0, from_samples=False)
+        return cls(transfer, scene.volume, scene.clipping, medium, albedo)
+
+    def positions(self) -> np.ndarray:
+        return node_positions(self.volume, self.transfer.shape(self.volume))
+
+    def nodes(self, index: Int[Array, "nodes"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes"]]:
+        """The transfer of some nodes, a chunk at a time."""
+        fill = -index.shape[0] % CHUNK
+        chunks = jnp.pad(jnp.asarray(self.positions())[index], ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3)
+        found = jax.lax.map(lambda p: self.project(p), chunks)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: index.shape[0]], found)
+
+    def project(self, p: Float[Array, "nodes 3"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes"]]:
+        """The transfer at grid positions."""
+        return project_nodes(self.transfer, self.volume, self.clipping, self.medium, self.albedo, p)
+
+    def active(self) -> Bool[Array, "nodes"]:
+        """Nodes with something visible no further away than the next node."""
+        p, occupancy = jnp.asarray(self.positions()), self.medium.occupancy
+        if occupancy is None:
+            return jnp.ones(p.shape[0], bool)
+        bricks, shape = occupancy.reach.shape, self.transfer.shape(self.volume)
+        b = [jnp.clip((p[:, i] / occupancy.size).astype(jnp.int32), 0, n - 1) for i, n in enumerate(bricks)]
+        near = max((n - 1) / max(m - 1, 1) for n, m in zip(self.volume.shape, shape, strict=True))
+        return occupancy.reach[b[0], b[1], b[2]] <= math.ceil(near / occupancy.size)
+
+
+def project_all(projection: TransferProjection) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes"]]:
+    """The transfer of all nodes of a scene, zero where nothing is to be seen; chunks without an active node are left out. Traceable."""
+    p, active = projection.positions(), projection.active()
+    fill = -len(p) % CHUNK
+    chunks = jnp.asarray(np.pad(p, ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3))
+    busy = jnp.pad(active, (0, fill)).reshape(-1, CHUNK)
+    # Not the bound method: JAX hashes what it is to call, and Equinox all that a method is bound to.
+    one = lambda p: projection.project(p)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(one, chunks[0]))
+
+    def chunk(inputs: tuple[Array, Array]) -> Any:
+        p, busy = inputs
+        found = jax.lax.cond(jnp.any(busy), one, lambda p: blank, p)
+        return jax.tree.map(lambda x: jnp.where(busy.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0), found)
+
+    found = jax.lax.map(chunk, (chunks, busy))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(p)], found)
+
+
+def finished(
+    scene: Scene, coefficients: Float[Array, "nodes channels bands"], opened: Float[Array, "nodes"]
+) -> ProjectedTransfer:
+    """What was projected, scattered and with its colour differences apart where the scene asks for that."""
+    transfer = transfer_of(scene)
+    shape = transfer.shape(scene.volume)
+    made_for = transfer.made_for(scene.transfer, scene.material)
+    grid = coefficients.reshape(*shape, *coefficients.shape[1:])
+    projected = ProjectedTransfer(grid, None, opened.reshape(shape), made_for)
+    projected = projected if transfer.scattering is None else scattered(scene, projected)
+    return projected if transfer.chromaticity is None else _separated(projected, transfer.chromaticity)
+
+
+def scattered(scene: Scene, projected: ProjectedTransfer) -> ProjectedTransfer:
+    """The transfer after the scattering pass."""
+    from jvr.effects.diffusion import scatter
+
+    transfer = transfer_of(scene)
+    coefficients, opened = scatter(
+        transfer.scattering, transfer.neighbourhood, scene.volume, projected.coefficients, projected.open
+    )
+    return ProjectedTransfer(coefficients, None, opened, projected.made_for, scattered=True)
+
+
+def _separated(projected: ProjectedTransfer, order: int) -> ProjectedTransfer:
+    """Luma, and colour differences up to an order (YCoCg, whose inverse is exact)."""
+    red, green, blue = jnp.moveaxis(projected.coefficients, 3, 0)
+    luma = 0.25 * (red + blue) + 0.5 * green
+    chroma = jnp.stack([0.5 * (red - blue), green - luma], axis=3)[..., : count(order)]
+    return ProjectedTransfer(luma[..., None, :], chroma, projected.open, projected.made_for, projected.scattered)
+
+
+def _shares(
+    projected: ProjectedTransfer, coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "bands 3"]
+) -> Float[Array, "x y z 3"]:
+    """The share of each colour of the light that arrives: the mean of the transfer over the directions that rays were sent into,
+    weighted with the light; 0 where there is no light. Ringing below zero is cut off."""
+    bands = min(coefficients.shape[-1], light.shape[0])
+    arriving = jnp.einsum("xyzcb,bh->xyzch", coefficients[..., :bands], light[:bands])
+    own = arriving[..., 0, :] if coefficients.shape[3] == 1 else jnp.diagonal(arriving, axis1=3, axis2=4)
+    all_light = math.sqrt(4 * math.pi) * light[0]
+    there = all_light != 0
+    opened = projected.open[..., None]
+    share = own / jnp.where(there, all_light, 1.0) / jnp.where(opened > 0, opened, 1.0)
+    return jnp.maximum(jnp.where(there & (opened > 0), share, 0.0), 0.0)
+
+
+def _products(
+    coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "bands 3"], order: int
+) -> Float[Array, "x y z products"]:
+    """Coefficients of light times transfer up to an order, all colours of each."""
+    matrix = product_matrix(light, math.isqrt(coefficients.shape[-1]) - 1, order)
+    kinds = "xyzcb,obc->xyzoc" if coefficients.shape[3] == 3 else "xyzcb,obh->xyzoh"
+    products = jnp.einsum(kinds, coefficients, matrix)
+    return products.reshape(*products.shape[:3], -1)

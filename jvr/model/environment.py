@@ -1,0 +1,107 @@
+"""Light from all around: radiance from far away as a function of direction, in spherical harmonics."""
+
+import math
+import os
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jvr.model import harmonics
+from jvr.model.checks import float_array, require
+from jvr.model.harmonics.projection import cap
+from jvr.numerics import normalise
+from jvr.types import ArrayLike
+
+
+class EnvironmentLight(eqx.Module):
+    """Radiance that arrives from direction `d` (pointing away from the scene): `L_i(d) = sum_j c_j Y_j(d)`, the same at every point.
+
+    **Arguments:** `coefficients`: `((order + 1)^2, 3)`, linear RGB, of `jvr.sh`'s functions in the world's axes; differentiable. `clamped`:
+    where the series rings below zero, what a sample reflects is cut off at zero; without it negative radiance may reach the picture.
+
+    Sums of environments are environments: `probe + EnvironmentLight.disc(...)`.
+    """
+
+    coefficients: Float[Array, "bands 3"]
+    clamped: bool = eqx.field(static=True)
+
+    def __init__(self, coefficients: ArrayLike, *, clamped: bool = True):
+        self.coefficients = float_array(coefficients, "coefficients", (None, 3))
+        require(self.coefficients, np.isfinite, "the coefficients of an environment must be finite")
+        harmonics.order_of(self.coefficients)
+        self.clamped = bool(clamped)
+
+    @classmethod
+    def from_image(
+        cls, image: str | os.PathLike | ArrayLike, order: int = 3, *, window: float | None = None, clamped: bool = True
+    ) -> "EnvironmentLight":
+        """The projection of a latitude-longitude map, y up: +X at u = 1/4, +Z at the centre, -X at u = 3/4.
+
+        **Arguments:** `image`: an OpenEXR or Radiance `.hdr` file, or `(height, 2 height, 3)` linear radiance; `window`: as
+        `jvr.sh.window`, against ringing about bright lamps; `None` for none. **Raises** `ValueError` for maps that are not 2:1 or hold NaN,
+        infinite or negative radiance, and what reading a file raises.
+        """
+        if isinstance(image, str | os.PathLike):
+            from jvr.io.environment import read_environment
+
+            image = read_environment(image)
+        pixels = float_array(image, "an environment map", (None, None, 3))
+        height, width, _ = pixels.shape
+        if width != 2 * height:
+            raise ValueError(f"an environment map is twice as wide as high, not {width} x {height}: crop or resample it to 2:1")
+        require(
+            pixels, lambda p: np.isfinite(p) & (p >= 0), "an environment map must be finite and not negative: mend its pixels"
+        )
+        return cls(_windowed(harmonics.project_map(pixels, order), window), clamped=clamped)
+
+    @classmethod
+    def from_function(
+        cls, fn: Callable[[Float[Array, "n 3"]], Float[Array, "n 3"]], order: int = 3, *, window: float | None = None
+    ) -> "EnvironmentLight":
+        """The projection of radiance given as a function of unit directions, `(n, 3)` -> `(n, 3)`."""
+        return cls(_windowed(harmonics.project(fn, order), window))
+
+    @classmethod
+    def constant(cls, radiance: ArrayLike = 1.0, order: int = 0) -> "EnvironmentLight":
+        """The same radiance, a number or `(3,)`, from everywhere."""
+        rgb = jnp.broadcast_to(float_array(radiance, "radiance", (), (3,)), (3,))
+        coefficients = jnp.zeros(((order + 1) ** 2, 3), rgb.dtype)
+        return cls(coefficients.at[0].set(math.sqrt(4 * math.pi) * rgb))
+
+    @classmethod
+    def disc(cls, towards: ArrayLike, half_angle: ArrayLike, radiance: ArrayLike = 1.0, order: int = 3) -> "EnvironmentLight":
+        """A round area light, far away: `radiance` (a number or `(3,)`) from all directions within `half_angle` degrees of `towards`,
+        `(3,)`; projected in closed form and differentiable in all three. **Raises** `ValueError` for angles outside of 0 to 180."""
+        angle = float_array(half_angle, "half_angle", ())
+        require(angle, lambda a: (a > 0) & (a <= 180), "half_angle must be above 0 and at most 180 degrees")
+        axis = float_array(towards, "towards", (3,))
+        require(jnp.linalg.norm(axis), lambda n: np.isfinite(n) & (n > 0), "towards must be a direction, not zero")
+        rgb = jnp.broadcast_to(float_array(radiance, "radiance", (), (3,)), (3,))
+        kernel = jnp.stack(cap(jnp.cos(jnp.deg2rad(angle)), order))
+        about = harmonics.evaluate(order, normalise(axis)[None])[0]
+        return cls(harmonics.convolve(about, kernel)[:, None] * rgb)
+
+    @property
+    def order(self) -> int:
+        return harmonics.order_of(self.coefficients)
+
+    def rotated(self, rotation: ArrayLike) -> "EnvironmentLight":
+        """The environment turned by a `(3, 3)` rotation: what came from `d` comes from `R d`. Coefficients alone are turned."""
+        return EnvironmentLight(harmonics.rotate(self.coefficients, rotation), clamped=self.clamped)
+
+    def radiance(self, directions: ArrayLike) -> Float[Array, "n 3"]:
+        """Radiance from directions `(n, 3)`, with whatever ringing there is."""
+        return harmonics.evaluate(self.order, directions) @ self.coefficients
+
+    def __add__(self, other: "EnvironmentLight") -> "EnvironmentLight":
+        if not isinstance(other, EnvironmentLight):
+            return NotImplemented
+        large, small = sorted((self.coefficients, other.coefficients), key=len, reverse=True)
+        return EnvironmentLight(large.at[: len(small)].add(small), clamped=self.clamped and other.clamped)
+
+
+def _windowed(coefficients: Float[Array, "bands 3"], window: float | None) -> Float[Array, "bands 3"]:
+    return coefficients if window is None else harmonics.window(coefficients, window)

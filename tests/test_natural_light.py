@@ -1,0 +1,417 @@
+"""Light from all around, materials under it, and radiance transfer: closed forms, white furnace, independent sums, gradients."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import OBLIQUE, compiled, linear_transfer, perspective, rotation, voxels
+
+import jvr
+from jvr.effects.natural_light import natural_light
+from jvr.effects.transfer_grid import TransferProjection, project_all
+from jvr.model.harmonics.projection import sphere_nodes
+from jvr.rendering.medium import absorbing
+
+SETTINGS = jvr.Settings(0.7, termination=0)
+CONSTANT = math.sqrt(4 * math.pi)
+
+
+def light(order=3, seed=0, clamped=True):
+    c = 0.3 * np.random.default_rng(seed).normal(size=((order + 1) ** 2, 3))
+    c[0] = 4.0
+    return jvr.EnvironmentLight(c, clamped=clamped)
+
+
+def scene(material=None, transfer=None, shape=(5, 6, 7), **parts):
+    parts = {"environment": light(), "material": material or jvr.LambertBRDF(), "radiance_transfer": transfer} | parts
+    return jvr.Scene(jvr.Volume(voxels(shape), OBLIQUE), linear_transfer(), **parts)
+
+
+def picture(scene, settings=SETTINGS):
+    camera = perspective(scene.volume, width=6, height=5)
+    return compiled(jvr.render, static_argnums=2)(scene, camera, settings).rgb
+
+
+def transfer_at(scene):
+    """Coefficients at the nodes of a scene, `(nodes, channels, bands)`, and `open`."""
+    return compiled(lambda s: project_all(TransferProjection.of(s, absorbing(s, None, s.radiance_transfer.needs_gradient))))(
+        scene
+    )
+
+
+# --- light -----------------------------------------------------------------------------------------------------------
+
+
+def test_radiance_of_a_disc_is_that_of_its_projection():
+    towards, half_angle = np.array([0.3, -0.5, 0.8]), 35.0
+    towards /= np.linalg.norm(towards)
+    with jax.enable_x64(True):
+        disc = jvr.EnvironmentLight.disc(towards, half_angle, [1.0, 2.0, 3.0], order=4)
+        inside = lambda d: (
+            jnp.where(d @ towards >= math.cos(math.radians(half_angle)), 1.0, 0.0)[:, None] * jnp.array([1.0, 2, 3])
+        )
+        by_quadrature = jvr.sh.project(inside, 4, degree=800)
+    np.testing.assert_allclose(disc.coefficients, by_quadrature, atol=5e-3)
+
+
+def test_rotating_the_light_and_the_directions_is_the_same():
+    turn, d = rotation(0.2, 0.9, -0.4), np.random.default_rng(0).normal(size=(10, 3))
+    np.testing.assert_allclose(light().rotated(turn).radiance(d @ turn.T), light().radiance(d), rtol=1e-5)
+
+
+def test_environments_add_up():
+    both = light(3) + light(1, seed=1)
+    d = np.random.default_rng(0).normal(size=(10, 3))
+    np.testing.assert_allclose(both.radiance(d), light(3).radiance(d) + light(1, seed=1).radiance(d), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.ones((8, 8, 3)), "2:1"),
+        (np.full((4, 8, 3), np.nan), "finite"),
+        (np.full((4, 8, 3), -1.0), "negative"),
+        (np.ones((4, 8)), "shape"),
+    ],
+)
+def test_maps_that_are_none_are_refused(image, message):
+    with pytest.raises(ValueError, match=message):
+        jvr.EnvironmentLight.from_image(image)
+
+
+# --- materials -------------------------------------------------------------------------------------------------------
+
+
+MATERIALS = {
+    "lambert": jvr.LambertBRDF(0.8),
+    "blinn-phong": jvr.BlinnPhongBRDF(0.5, 0.4, 12.0),
+    "microfacet": jvr.MicrofacetBRDF(roughness=0.6),
+    "phase": jvr.PhaseBRDF(jvr.HenyeyGreenstein(0.4), 0.9),
+}
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_what_is_reflected_is_the_integral_of_material_and_light(name):
+    """Against the sum over directions of the material's own projection in the world."""
+    brdf, env = MATERIALS[name], light()
+    with jax.enable_x64(True):
+        brdf, env = jax.tree.map(lambda x: x.astype(float), (brdf, env))
+        material = jvr.HarmonicMaterial.project(brdf, 3, directions=64, nodes=48)
+        natural = natural_light(material, env.coefficients, clamped=False, order=3, from_samples=False)
+        nodes, weights = sphere_nodes(160)
+        functions, radiance = np.asarray(jvr.sh.evaluate(3, nodes)), np.asarray(env.coefficients)
+        rng = np.random.default_rng(0)
+        for _ in range(3):
+            n, w_o = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+            n = n if n @ w_o > 0 else -n
+            t = w_o - (w_o @ n) * n
+            frame = np.stack([t / np.linalg.norm(t), np.cross(n, t / np.linalg.norm(t)), n])
+            own_o, own_i = frame @ w_o, frame @ nodes.T
+            parts = brdf.evaluate(tuple(map(jnp.asarray, own_o)), tuple(map(jnp.asarray, own_i)))
+            found = natural.reflect(jnp.asarray(0.5), jnp.asarray(1.0), tuple(jnp.asarray(n)), tuple(jnp.asarray(w_o)), ())
+            for part, value in zip(parts, found, strict=True):
+                expected = [
+                    (functions.T @ (weights * np.asarray(part[c % len(part)]))) @ radiance[:, c] if part else 0.0
+                    for c in range(3)
+                ]
+                np.testing.assert_allclose(value, expected, atol=4e-3)
+
+
+@pytest.mark.parametrize("order", [0, 3])
+@pytest.mark.parametrize("material", [jvr.LambertBRDF(1.0), jvr.PhaseBRDF(jvr.HenyeyGreenstein(0.7))])
+def test_white_furnace(material, order):
+    """A material that absorbs nothing under light of one shows the colour of the medium."""
+    lit = scene(material, environment=jvr.EnvironmentLight.constant(1.0, order))
+    unlit = dataclasses.replace(lit, environment=None, material=None)
+    np.testing.assert_allclose(picture(lit), picture(unlit), atol=2e-5)
+
+
+def test_a_vanishing_gradient_shows_the_mean_of_the_light():
+    flat = jvr.Volume(np.full((4, 4, 4), 0.5))
+    lit = dataclasses.replace(scene(), volume=flat)
+    unlit = dataclasses.replace(lit, environment=None, material=None)
+    mean = np.asarray(light().coefficients[0]) / CONSTANT
+    np.testing.assert_allclose(picture(lit), picture(unlit) * mean, rtol=1e-4)
+
+
+def test_materials_by_value_are_linear_between_their_positions():
+    kinds = jvr.LambertBRDF(0.2), jvr.BlinnPhongBRDF(0.6, 0.0)
+    both = jvr.MaterialByValue([0.0, 1.0], kinds).projected(3)
+    alone = [kind.projected(3) for kind in kinds]
+    n, w_o = (jnp.array(v) / np.linalg.norm(v) for v in ([1.0, 2, 3], [1.0, 0, 2]))
+    at = lambda m, s: natural_light(m, light().coefficients, clamped=True, order=3, from_samples=False).reflect(
+        jnp.asarray(s), jnp.asarray(1.0), tuple(n), tuple(w_o), ()
+    )[0]
+    values = [np.array(at(m, 0.0)) for m in alone]
+    for s in (-1.0, 0.0, 0.25, 1.0, 2.0):
+        share = min(max(s, 0.0), 1.0)
+        np.testing.assert_allclose(at(both, s), (1 - share) * values[0] + share * values[1], rtol=1e-4)
+
+
+def test_phase_functions_and_surfaces_do_not_mix_by_value():
+    with pytest.raises(ValueError, match="phase function"):
+        jvr.MaterialByValue([0.0, 1.0], [jvr.LambertBRDF(), MATERIALS["phase"]]).projected(2)
+
+
+def test_ringing_is_cut_off_unless_it_is_asked_for():
+    lamp = jvr.EnvironmentLight.disc([0, 0, 1], 3.0, 1e4)
+    assert np.min(picture(scene(jvr.PhaseBRDF(jvr.HenyeyGreenstein(0.9)), environment=lamp))) >= 0
+    rings = jvr.EnvironmentLight(lamp.coefficients, clamped=False)
+    assert np.min(picture(scene(jvr.PhaseBRDF(jvr.HenyeyGreenstein(0.9)), environment=rings))) < 0
+
+
+# --- radiance transfer -----------------------------------------------------------------------------------------------
+
+
+def test_nothing_in_the_way_is_a_transfer_of_one():
+    empty = jvr.LinearTransfer([0.0, 1.0], [[1, 1, 1]] * 2, [0.0, 0.0])
+    c, opened = transfer_at(dataclasses.replace(scene(transfer=jvr.RadianceTransfer(rays=256)), transfer=empty))
+    np.testing.assert_allclose(opened, 1.0)
+    np.testing.assert_allclose(c[:, 0, 0], CONSTANT, rtol=1e-5)
+    np.testing.assert_allclose(c[:, 0, 1:], 0.0, atol=0.05)
+
+
+def test_above_an_opaque_half_space_is_a_hemisphere():
+    """Visibility is 1 above the horizon and 0 below: coefficients of the cap in closed form."""
+    values = np.broadcast_to(np.linspace(1, 0, 21)[None, None], (41, 41, 21))
+    opaque = jvr.LinearTransfer([0.0, 0.499, 0.501, 1.0], [[1, 1, 1]] * 4, [0.0, 0.0, 1e3, 1e3])
+    half_space = jvr.Scene(
+        jvr.Volume(values),
+        opaque,
+        environment=light(),
+        material=jvr.LambertBRDF(),
+        radiance_transfer=jvr.RadianceTransfer(rays=1024, resolution=0.1, start=0.0),
+    )
+    projection = TransferProjection.of(half_space, absorbing(half_space, None, False))
+    c, opened = compiled(lambda q, p: q.project(p))(projection, jnp.array([[20.0, 20.0, 10.2]]))
+    from jvr.model.harmonics.projection import cap
+
+    expected = np.zeros(16)
+    expected[np.arange(4) * np.arange(1, 5)] = jnp.stack(cap(jnp.asarray(0.0), 3))
+    np.testing.assert_allclose(c[0, 0], expected, atol=0.05)
+    assert 0.5 <= float(opened[0]) < 1
+
+
+def test_transfer_is_a_plain_sum_over_rays():
+    """A loop over directions and steps, by the equations, in NumPy."""
+    transfer = jvr.RadianceTransfer(order=2, rays=7, resolution=1.0, start=0.0, growth=1.3, termination=0.0)
+    lit = scene(transfer=transfer)
+    c, opened = transfer_at(lit)
+    assert np.all(np.asarray(opened) >= 0.5)
+    p = np.array([2.0, 3.0, 3.0])
+    index = int(np.ravel_multi_index((2, 3, 3), (5, 6, 7)))
+    volume, table = lit.volume, lit.transfer
+    extinction = lambda p: float(table.evaluate(volume.sample(tuple(jnp.asarray(p, jnp.float32)))).sigma_t[0])
+    spacing = float(jnp.min(volume.spacing))
+    transparency = lambda p: math.exp(-spacing * extinction(np.clip(p, 0, np.array(volume.shape) - 1)))
+    grid = np.array([transparency(p + 0.5 * e) - transparency(p - 0.5 * e) for e in np.eye(3)])
+    gradient = np.linalg.inv(OBLIQUE[:3, :3]).T @ grid
+    m = np.linalg.norm(gradient)
+    strength = (1 - transparency(p)) * (m * spacing) ** 2 / ((m * spacing) ** 2 + 0.1**2)
+    sine = math.sin(math.pi / 2 * (1 - strength))
+    assert float(opened[index]) == pytest.approx((1 + sine) / 2, rel=1e-4)
+    axis = gradient / m
+    sign = 1.0 if axis[2] >= 0 else -1.0
+    a = -1 / (sign + axis[2])
+    b = axis[0] * axis[1] * a
+    frame = np.array([[1 + sign * axis[0] ** 2 * a, sign * b, -sign * axis[0]], [b, sign + axis[1] ** 2 * a, -axis[1]], axis])
+    ends = 2 * float(volume.radius) * transfer.boundaries(volume.shape)
+    total = np.zeros(9)
+    for k in range(7):
+        cosine = 1 - (1 + sine) * (k + 0.5) / 7
+        around, radius = math.pi * (3 - math.sqrt(5)) * k, math.sqrt(1 - cosine**2)
+        d = np.array([radius * math.cos(around), radius * math.sin(around), cosine]) @ frame
+        along = np.linalg.inv(OBLIQUE[:3, :3]) @ d
+        with np.errstate(divide="ignore"):
+            out = min(np.maximum((0 - p) / along, (np.array(volume.shape) - 1 - p) / along))
+        tau = 0.0
+        for begin, end in zip(ends[:-1], ends[1:], strict=True):
+            low, high = min(begin, out), min(end, out)
+            tau += (high - low) * extinction(p + 0.5 * (low + high) * along) if high > low else 0.0
+        total += math.exp(-tau) * np.asarray(jvr.sh.evaluate(2, d[None])[0]) * 2 * math.pi * (1 + sine) / 7
+    np.testing.assert_allclose(c[index, 0], total, rtol=2e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_white_medium_that_bleeds_hides_nothing(exact):
+    """What rays pass is as bright as what is behind it."""
+    transfer = jvr.RadianceTransfer(resolution=1.0, bleeding=jvr.TransferBleeding(), exact=exact, surface=1e6)
+    white = jvr.LinearTransfer([0.0, 1.0], [[1, 1, 1]] * 2, [0.1, 1.5])
+    lit = dataclasses.replace(scene(transfer=transfer), transfer=white)
+    without = dataclasses.replace(lit, radiance_transfer=None)
+    np.testing.assert_allclose(picture(lit), picture(without), rtol=0.03)
+
+
+def test_material_and_transfer_bleed_alike_where_the_material_reflects_all():
+    kinds = [jvr.RadianceTransfer(resolution=1.0, bleeding=kind) for kind in (jvr.TransferBleeding(), jvr.MaterialBleeding())]
+    coefficients = [transfer_at(scene(jvr.LambertBRDF(1.0), kind))[0] for kind in kinds]
+    np.testing.assert_allclose(*coefficients, atol=2e-3)
+    grey = transfer_at(scene(jvr.LambertBRDF(0.5), kinds[1]))[0]
+    assert np.all(np.asarray(grey[:, :, 0]) < np.asarray(coefficients[1][:, :, 0]))
+
+
+def test_clipped_medium_is_not_in_the_way():
+    clip = jvr.ClippingBox([-100, -100, -100], [100, 100, -99])
+    c, _ = transfer_at(scene(transfer=jvr.RadianceTransfer(surface=1e6), clipping=clip))
+    np.testing.assert_allclose(c[:, 0, 0], CONSTANT, rtol=1e-5)
+
+
+def test_luma_and_colour_differences_are_the_same_colours():
+    transfer = jvr.RadianceTransfer(resolution=1.0, bleeding=jvr.TransferBleeding(), chromaticity=3)
+    whole = picture(
+        scene(
+            transfer=dataclasses.replace(scene(), radiance_transfer=None)
+            and jvr.RadianceTransfer(resolution=1.0, bleeding=jvr.TransferBleeding())
+        )
+    )
+    np.testing.assert_allclose(picture(scene(transfer=transfer)), whole, rtol=1e-4)
+
+
+@pytest.mark.parametrize("dipole", ["marble", "skin1"])
+def test_the_scattering_pass_is_the_direct_sum(dipole):
+    from jvr.effects.diffusion import kernel_of, scatter
+
+    dipole, shape = jvr.Dipole.preset(dipole), (4, 5, 3)
+    volume = jvr.Volume(voxels((10, 13, 7)), OBLIQUE)
+    rng = np.random.default_rng(0)
+    c, opened = rng.normal(size=(*shape, 1, 4)).astype(np.float32), np.where(rng.random(shape) > 0.3, 1.0, 0.0).astype(np.float32)
+    found, _ = scatter(dipole, 0.5, volume, jnp.asarray(c), jnp.asarray(opened))
+    kernel = np.asarray(kernel_of(dipole, 0.5, volume, shape))
+    half = np.array(kernel.shape[1:]) // 2
+    for i in np.ndindex(*shape):
+        weights = np.zeros((3, *shape))
+        for j in np.ndindex(*shape):
+            offset = np.array(i) - np.array(j) + half
+            if opened[j] and np.all(offset >= 0) and np.all(offset < kernel.shape[1:]):
+                weights[(slice(None), *j)] = kernel[(slice(None), *offset)]
+        for channel in range(3):
+            if not opened[i]:
+                np.testing.assert_array_equal(found[i][channel], 0)
+                continue
+            mean = np.tensordot(weights[channel], c[..., 0, :], axes=3) / weights[channel].sum()
+            np.testing.assert_allclose(found[i][channel], dipole.total[channel] * mean, rtol=2e-3, atol=2e-4)
+
+
+def test_computed_beforehand_and_in_the_picture_are_the_same(tmp_path):
+    lit = scene(transfer=jvr.RadianceTransfer(rays=16), shape=(7, 9, 8))
+    shares = []
+    frozen = jvr.precompute(lit, cache=tmp_path, progress=shares.append)
+    assert shares[-1] == 1.0
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    again = jvr.precompute(lit, cache=tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == kept
+    for other in (frozen, again):
+        np.testing.assert_allclose(picture(other), picture(lit), atol=1e-5)
+    for path in kept:
+        path.write_bytes(path.read_bytes()[:100])
+    np.testing.assert_allclose(picture(jvr.precompute(lit, cache=tmp_path)), picture(lit), atol=1e-5)
+
+
+def test_an_outdated_transfer_is_announced():
+    frozen = jvr.precompute(scene(transfer=jvr.RadianceTransfer(rays=8)))
+    changed = dataclasses.replace(frozen, transfer=linear_transfer(seed=5))
+    with pytest.warns(RuntimeWarning, match="another transfer function"):
+        jvr.render(changed, perspective(changed.volume, width=4, height=4), SETTINGS)
+
+
+def test_single_voxels_and_opaque_insides_have_no_nan():
+    for shape in ((1, 1, 1), (1, 4, 4)):
+        lit = scene(transfer=jvr.RadianceTransfer(rays=8), shape=shape)
+        assert np.all(np.isfinite(picture(lit)))
+    opaque = jvr.LinearTransfer([0.0, 1.0], [[1, 1, 1]] * 2, [1e6, 1e6])
+    assert np.all(np.isfinite(picture(dataclasses.replace(scene(transfer=jvr.RadianceTransfer(rays=8)), transfer=opaque))))
+
+
+@pytest.mark.parametrize(
+    ("transfer", "message"),
+    [
+        ({"order": -1}, "order"),
+        ({"rays": 0}, "rays"),
+        ({"resolution": 2.0}, "resolution"),
+        ({"termination": 1.0}, "termination"),
+        ({"chromaticity": 1}, "bleeding"),
+        ({"growth": 0.5}, "growth"),
+        ({"surface": 0}, "surface"),
+    ],
+)
+def test_settings_that_cannot_be_met_are_refused(transfer, message):
+    with pytest.raises(ValueError, match=message):
+        jvr.RadianceTransfer(**transfer)
+
+
+def test_a_transfer_that_takes_too_much_memory_is_refused():
+    with pytest.raises(ValueError, match="a resolution of"):
+        picture(scene(transfer=jvr.RadianceTransfer(memory=100)))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"material": None},
+        {"environment": None},
+        {"environment": None, "material": None, "radiance_transfer": jvr.RadianceTransfer()},
+    ],
+)
+def test_parts_that_do_not_go_together_are_refused(parts):
+    with pytest.raises(ValueError, match="set environment|set material|radiance transfer"):
+        jvr.Scene(jvr.Volume(voxels()), linear_transfer(), **({"environment": light(), "material": jvr.LambertBRDF()} | parts))
+
+
+# --- gradients -------------------------------------------------------------------------------------------------------
+
+
+GRADIENTS = {
+    "light": ("environment.coefficients", jvr.LambertBRDF(0.8), None),
+    "roughness": ("material.roughness", jvr.MicrofacetBRDF(roughness=0.6), None),
+    "lambert, shares": ("environment.coefficients", jvr.LambertBRDF(0.8), jvr.RadianceTransfer(rays=8, resolution=1.0)),
+    "transfer function through the transfer": (
+        "transfer.sigma_t",
+        jvr.LambertBRDF(0.8),
+        jvr.RadianceTransfer(rays=8, resolution=0.5, exact=True),
+    ),
+    "transfer function through bleeding": (
+        "transfer.rgb",
+        jvr.LambertBRDF(0.8),
+        jvr.RadianceTransfer(rays=8, resolution=0.5, bleeding=jvr.MaterialBleeding()),
+    ),
+    "voxels": ("volume.values", jvr.LambertBRDF(0.8), jvr.RadianceTransfer(rays=8, resolution=0.5)),
+    "dipole": (
+        "radiance_transfer.scattering.sigma_a",
+        jvr.PhaseBRDF(jvr.Isotropic()),
+        jvr.RadianceTransfer(rays=8, resolution=1.0, scattering=jvr.Dipole.preset("skin1"), neighbourhood=0.5),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_gradients_against_differences(name):
+    """Reverse mode, forward mode and central differences in float64, in a random direction of the unknowns."""
+    path, material, transfer = GRADIENTS[name]
+    import equinox as eqx
+
+    with jax.enable_x64(True):
+        lit = jax.tree.map(
+            lambda x: x.astype(float), scene(material, transfer, shape=(4, 4, 5), environment=light(clamped=False))
+        )
+        where = lambda s: eval(f"s.{path}", {"s": s})
+        camera = perspective(lit.volume, width=3, height=3)
+        weights = jnp.asarray(np.random.default_rng(3).normal(size=(3, 3, 3)))
+        settings = jvr.Settings(1.1, termination=0, skipping=False)
+
+        def f(x, adjoint=jvr.Replay()):
+            chosen = dataclasses.replace(settings, adjoint=adjoint)
+            return jnp.sum(weights * jvr.render(eqx.tree_at(where, lit, x), camera, chosen).rgb)
+
+        x = where(lit)
+        along = jnp.asarray(np.random.default_rng(4).normal(size=x.shape)) * jnp.maximum(jnp.abs(x), 1e-3)
+        h = 1e-6
+        value = compiled(f)
+        difference = (value(x + h * along) - value(x - h * along)) / (2 * h)
+        reverse = jnp.sum(compiled(jax.grad(f))(x) * along)
+        forward = compiled(lambda x: jax.jvp(lambda x: f(x, jvr.Forward()), (x,), (along,))[1])(x)
+    assert abs(float(difference)) > 1e-6
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    np.testing.assert_allclose(reverse, difference, rtol=1e-5, atol=1e-9)
