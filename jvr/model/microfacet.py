@@ -22,8 +22,8 @@ from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 Numbers = Float[Array, "..."]
-# Angles of the table of reflectances, and mirrors along and across for each: errors below 0.1 %, in a fraction of a millisecond.
-_ANGLES, _ALONG, _ACROSS = 64, 24, 12
+# Angles of the table of reflectances, and mirrors down and around for each: errors of at most 0.001 at any roughness.
+_ANGLES, _DOWN, _AROUND = 64, 48, 16
 
 
 class MicrofacetBRDF(AbstractBRDF):
@@ -56,9 +56,9 @@ class MicrofacetBRDF(AbstractBRDF):
         self.base, self.metallic = share(base, "base", (), (3,)), share(metallic, "metallic", ())
         self.reflectance_at_normal = share(reflectance_at_normal, "reflectance_at_normal", (), (3,))
         self.roughness = float_array(roughness, "roughness", ())
-        # Below, the peak of D and its derivatives leave float32.
+        # Below, the peak of D and its derivatives leave float32; 0.001 itself may be rounded.
         smooth = "roughness must be in [0.001, 1]; 0.001 is as good as a mirror"
-        require(self.roughness, lambda r: (r >= np.float32(0.001)) & (r <= 1), smooth)
+        require(self.roughness, lambda r: (r > 0.000999) & (r <= 1), smooth)
 
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
         w_o, w_i = of_one_shape(w_o, w_i)
@@ -105,18 +105,22 @@ def reflectances(alpha: Scalar) -> tuple[Float[Array, "m"], Float[Array, "m"], F
     """
     # Denser at grazing angles, where the shares change fastest.
     cosine = jnp.square(jnp.linspace(0.0, 1.0, _ANGLES))
-    nodes, weights = np.polynomial.legendre.leggauss(_ALONG)
-    up, weights = (jnp.asarray(a, cosine.dtype)[:, None] for a in (0.5 * (nodes + 1), 0.5 * weights / _ACROSS))
+    # Denser at the end of the cap whose mirrors are steep, where smooth surfaces stop reflecting upwards.
+    nodes, weights = np.polynomial.legendre.leggauss(_DOWN)
+    down, weights = (0.5 * (nodes + 1)) ** 2, 0.5 * weights * (nodes + 1) / _AROUND
+    down, weights = (jnp.asarray(a, cosine.dtype)[:, None] for a in (down, weights))
     # Half a turn: the other is its mirror image.
-    azimuth = jnp.pi * (jnp.arange(_ACROSS) + 0.5) / _ACROSS
+    azimuth = jnp.pi * (jnp.arange(_AROUND) + 0.5) / _AROUND
 
     def shares(cos_o: Scalar) -> tuple[Scalar, Scalar]:
         sin_o = jnp.sqrt(1.0 - cos_o * cos_o)
         (x, _, z), _ = direction_and_length((alpha * sin_o, jnp.zeros_like(cos_o), cos_o))
-        cap = 1.0 - up * (1.0 + z)
-        ring = jnp.sqrt((1.0 - cap) * (1.0 + cap))
-        stretched = (ring * jnp.cos(azimuth) + x, ring * jnp.sin(azimuth), cap + z + jnp.zeros_like(azimuth))
-        h, _ = direction_and_length((alpha * stretched[0], alpha * stretched[1], stretched[2]))
+        # A point of the cap above -z, of height (1 + z) down - z, plus the direction; the radius in a form that does not cancel.
+        height = (1.0 + z) * down
+        ring = jnp.sqrt((1.0 - down) * (1.0 + z) * (height + x * x / (1.0 + z)))
+        h, _ = direction_and_length(
+            (alpha * (ring * jnp.cos(azimuth) + x), alpha * ring * jnp.sin(azimuth), jnp.broadcast_to(height, (_DOWN, _AROUND)))
+        )
         seen = sin_o * h[0] + cos_o * h[2]
         cos_i = jnp.maximum(2.0 * seen * h[2] - cos_o, 0.0)
         # Masking and shadowing over masking alone, by what is left of `visibility` without the cosine of `w_o`.
