@@ -191,6 +191,10 @@ class RadianceTransfer(AbstractRadianceTransfer):
     def is_frozen(self) -> bool:
         return self.projected is not None
 
+    @property
+    def is_final(self) -> bool:
+        return self.projected is not None and (self.scattering is None or self.projected.scattered)
+
     def shape(self, volume: Volume) -> tuple[int, int, int]:
         """Nodes along each axis. **Raises** `ValueError` where their coefficients would exceed `memory`."""
         x, y, z = (1 if n == 1 else max(2, math.ceil((n - 1) * self.resolution) + 1) for n in volume.shape)
