@@ -28,6 +28,7 @@ import jvr
 from benchmarks.peers import ours, scenes
 from benchmarks.timing import median, seconds
 from experiments.accuracy_vs_time import machine
+from jvr.effects.transfer_grid import projected_of
 from jvr.model.harmonics.projection import map_directions
 
 DEFAULT: dict[str, Any] = {"order": 3, "rays": 64, "resolution": 1 / 3}
@@ -120,10 +121,10 @@ def _row(
     made, row = {}, {}
     project = lambda: made.update(scene=jvr.precompute(lit(jvr.RadianceTransfer(**given))))
     row["projection_seconds"] = min(seconds({"": lambda: project() or 0}, repeats=1)[""])
-    frozen = made["scene"].radiance_transfer
-    row["bytes"] = frozen.projected.nbytes
+    projected = projected_of(made["scene"])
+    row["bytes"] = projected.nbytes
     for kind in ("shortcut", "exact"):
-        chosen = jvr.RadianceTransfer(**given, exact=kind == "exact").with_projected(frozen.projected)
+        chosen = jvr.RadianceTransfer(**given, exact=kind == "exact").with_projected(projected)
         frame = dataclasses.replace(made["scene"], radiance_transfer=chosen)
         row[f"{kind}_error"] = relative(np.asarray(jvr.render(frame, camera).rgb, np.float64), exact)
         row[f"{kind}_seconds"] = median(seconds({"": lambda s=frame: jvr.render(s, camera).rgb}, repeats=3), "")
@@ -151,7 +152,7 @@ def _chromaticity(lit: Any, camera: jvr.PerspectiveCamera, quick: bool) -> list[
         frozen = jvr.precompute(lit(DEFAULT["order"], transfer))
         picture = np.asarray(jvr.render(frozen, camera).rgb, np.float64)
         whole = picture if whole is None else whole
-        rows.append({"order": order, "bytes": frozen.radiance_transfer.projected.nbytes, "error": relative(picture, whole)})
+        rows.append({"order": order, "bytes": projected_of(frozen).nbytes, "error": relative(picture, whole)})
     return rows
 
 

@@ -23,7 +23,7 @@ from benchmarks.peers import ours, scenes
 from benchmarks.timing import median, ratio, seconds
 from experiments.accuracy_vs_time import machine
 from experiments.sh_accuracy import sky
-from jvr.effects.transfer_grid import TransferProjection
+from jvr.effects.transfer_grid import TransferProjection, projected_of
 from jvr.rendering.medium import absorbing, occupancy
 
 SIZES = ((128, 128, 128), (256, 256, 128), (256, 256, 256))
@@ -73,9 +73,9 @@ def measured(shape: tuple[int, int, int], size: int, repeats: int) -> dict[str, 
         times = seconds({"": lambda s=scene, shares=shares: jvr.precompute(s, progress=shares.append) and 0}, repeats=repeats)
         frozen = jvr.precompute(scene)
         row[f"{name}: projection seconds"] = median(times, "")
-        row[f"{name}: bytes"] = frozen.radiance_transfer.projected.nbytes
+        row[f"{name}: bytes"] = projected_of(frozen).nbytes
         pictures[name] = frozen
-    exact = jvr.RadianceTransfer(exact=True).with_projected(pictures["shadows"].radiance_transfer.projected)
+    exact = jvr.RadianceTransfer(exact=True).with_projected(projected_of(pictures["shadows"]))
     pictures["shadows, exact product"] = dataclasses.replace(lit, radiance_transfer=exact)
     # The angle changes each time: coefficients are turned anew, and everything that depends on the light follows.
     angle = iter(np.linspace(0, 3, 1000))
