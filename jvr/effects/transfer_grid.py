@@ -175,7 +175,7 @@ def _separated(projected: ProjectedTransfer, order: int) -> ProjectedTransfer:
 
 
 def _shares(
-    projected: ProjectedTransfer, coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "bands 3"]
+    projected: ProjectedTransfer, coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "light_bands 3"]
 ) -> Float[Array, "x y z 3"]:
     """The share of each colour of the light that arrives: the mean of the transfer over the directions that rays were sent into,
     weighted with the light; 0 where there is no light. Ringing below zero is cut off."""
@@ -190,7 +190,7 @@ def _shares(
 
 
 def _products(
-    coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "bands 3"], order: int
+    coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "light_bands 3"], order: int
 ) -> Float[Array, "x y z products"]:
     """Coefficients of light times transfer up to an order, all colours of each."""
     matrix = product_matrix(light, math.isqrt(coefficients.shape[-1]) - 1, order)
