@@ -141,8 +141,8 @@ def compare(of: Study) -> Result:
     images = noisy([picture(truth, camera) for camera in cameras])
     pictures = {"truth": [picture(scene, held_out) for scene in (truth, other)]}
     say(f"rendered {len(images)} views of {of.volume} under {of.names[0]} at order {true_order}")
-    wanted = of.light(0, order).coefficients
     exact = of.lit(0, order, rays, exact=True)
+    wanted = of.light(0, order).coefficients
     models = {
         "exact product": exact,
         "two double products": of.lit(0, order, rays, exact=False),
@@ -151,11 +151,10 @@ def compare(of: Study) -> Result:
     rows, found = [], {}
     for name, model in models.items():
         start = dataclasses.replace(model, environment=jvr.EnvironmentLight(_constant(order), clamped=False))
-        result = jvr.fit(start, cameras, images, unknowns=lambda s: s.environment.coefficients, settings=of.settings, max_steps=8)
-        environment = result.scene.environment
-        assert environment is not None
+        coefficients: Any = lambda s: s.environment.coefficients
+        result = jvr.fit(start, cameras, images, unknowns=coefficients, settings=of.settings, max_steps=8)
         say(f"{name}: {len(result.history)} steps, {result.stats.seconds:.0f} s")
-        found[name] = jvr.EnvironmentLight(environment.coefficients)
+        found[name] = jvr.EnvironmentLight(coefficients(result.scene))
         errors = np.asarray(result.standard_errors)
         rows.append(
             {
@@ -167,7 +166,7 @@ def compare(of: Study) -> Result:
                     np.sqrt(result.stats.residual_variance) / (NOISE * max(float(np.max(i)) for i in images))
                 ),
                 "determined": result.stats.rank,
-                "coefficients": _distance(environment.coefficients, wanted),
+                "coefficients": _distance(coefficients(result.scene), wanted),
                 "standard_error": float(np.sqrt(np.sum(np.square(errors)) / np.sum(np.square(wanted)))),
             }
         )
@@ -210,8 +209,9 @@ def show(rows: list[dict[str, Any]]) -> None:
 
 def toned(radiance: np.ndarray, like: np.ndarray) -> np.ndarray:
     """For display: `L / (L + K)`, then sRGB, `K` the radiance that nine tenths of what is lit in `like` stay below."""
-    bright = np.max(like, axis=-1)
-    return srgb_from_linear(np.maximum(radiance, 0) / (np.maximum(radiance, 0) + np.percentile(bright[bright > 0], 90)))
+    bright, radiance = np.max(like, axis=-1), np.maximum(radiance, 0)
+    # Noise is not light.
+    return srgb_from_linear(radiance / (radiance + np.percentile(bright[bright > 5 * NOISE * bright.max()], 90)))
 
 
 def figure(of: Study, result: Result, path: str) -> None:
@@ -219,7 +219,7 @@ def figure(of: Study, result: Result, path: str) -> None:
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(11, 10.5), layout="constrained")
-    of_views, of_maps, of_pictures = drawing.subfigures(3, 1, height_ratios=[1.05, 0.95, 2.0])
+    of_views, of_maps, of_pictures = drawing.subfigures(3, 1, height_ratios=[1.05, 0.95, 2.0], squeeze=False).ravel()
     of_views.suptitle(
         "The views that were fitted, 1 % noise; everywhere L / (L + K), then sRGB, K as the true picture or map has it",
         fontsize=10,
@@ -241,6 +241,9 @@ def figure(of: Study, result: Result, path: str) -> None:
     panels = of_pictures.subplots(2, len(result.pictures))
     for which, (row, key) in enumerate(zip(panels, ("held_out", "relit"), strict=True)):
         for panel, (name, images) in zip(row, result.pictures.items(), strict=True):
+            if which == 1 and "true light" in name:
+                panel.set_axis_off()  # it is the picture of the exact product
+                continue
             panel.imshow(toned(images[which], result.pictures["truth"][which]))
             score = next((r[key] for r in result.rows if r["model"] == name), None)
             text = f"{score['psnr']:.1f} dB, {score['relative_rmse']:.1%}" if score else f"under {of.names[which]}"
