@@ -78,6 +78,13 @@ def transfer_of(scene: Scene) -> RadianceTransfer:
     return scene.radiance_transfer
 
 
+def projected_of(scene: Scene) -> ProjectedTransfer:
+    """The radiance transfer of a scene that it has been computed for."""
+    projected = transfer_of(scene).projected
+    assert projected is not None
+    return projected
+
+
 class TransferProjection(eqx.Module):
     """All that the nodes of a scene are projected with. `albedo`: what a material reflects of light of one from everywhere, where rays
     pick that up."""
@@ -175,7 +182,7 @@ def _separated(projected: ProjectedTransfer, order: int) -> ProjectedTransfer:
 
 
 def _shares(
-    projected: ProjectedTransfer, coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "light_bands 3"]
+    projected: ProjectedTransfer, coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "others 3"]
 ) -> Float[Array, "x y z 3"]:
     """The share of each colour of the light that arrives: the mean of the transfer over the directions that rays were sent into,
     weighted with the light; 0 where there is no light. Ringing below zero is cut off."""
@@ -190,7 +197,7 @@ def _shares(
 
 
 def _products(
-    coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "light_bands 3"], order: int
+    coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "others 3"], order: int
 ) -> Float[Array, "x y z products"]:
     """Coefficients of light times transfer up to an order, all colours of each."""
     matrix = product_matrix(light, math.isqrt(coefficients.shape[-1]) - 1, order)

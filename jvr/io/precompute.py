@@ -3,10 +3,11 @@
 import dataclasses
 import hashlib
 import os
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,8 +30,24 @@ TOGETHER = 2048
 Progress = Callable[[float], Any]
 
 
+class Precomputed(NamedTuple):
+    """One part that was computed beforehand: `part`, "material" or "radiance transfer"; `seconds` that it took; `cached`, whether it was
+    read from the folder; `nbytes` of its numbers."""
+
+    part: str
+    seconds: float
+    cached: bool
+    nbytes: int
+
+
 def precompute(
-    scene: Scene, *, cache: str | os.PathLike | None = None, progress: Progress | None = None, keep_unscattered: bool = False
+    scene: Scene,
+    *,
+    cache: str | os.PathLike | None = None,
+    progress: Progress | None = None,
+    report: Callable[[Precomputed], Any] | None = None,
+    keep_material: bool = False,
+    keep_unscattered: bool = False,
 ) -> Scene:
     """The scene with its material projected on harmonics and its radiance transfer computed, so that pictures from any camera and under
     any environment do neither again.
@@ -40,7 +57,8 @@ def precompute(
     `jvr.MaterialBleeding()`. `jvr.render` warns where the transfer function is not the one that it was made for.
 
     **Arguments:** `cache`: a folder to keep results in, named by the content of what they were computed from; `progress`: called with the
-    share that is done, 0 ... 1; `keep_unscattered`: leave the scattering pass to each picture, so that the dipole can be fitted.
+    share that is done, 0 ... 1; `report`: called with each part once it is there; `keep_material`: leave the material as it is, and
+    `keep_unscattered`: leave the scattering pass to each picture, so that material and dipole can be fitted.
     Not traceable. **Raises** `OSError` where the folder cannot be written.
     """
     environment = scene.environment
@@ -49,8 +67,12 @@ def precompute(
     folder = None if cache is None else Path(cache)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    project = lambda material: material.projected(environment.order)
-    scene = dataclasses.replace(scene, material=_kept(folder, project, scene.material, lambda: jax.jit(project)(scene.material)))
+    report = report or (lambda done: None)
+    if not keep_material:
+        material = (scene.material, np.asarray(environment.order))
+        project = lambda inputs: inputs[0].projected(environment.order)
+        projected = _kept(folder, project, material, lambda: jax.jit(project)(material), "material", report)
+        scene = dataclasses.replace(scene, material=projected)
     if scene.radiance_transfer is None or scene.radiance_transfer.is_frozen:
         return scene
     transfer = transfer_of(scene)
@@ -67,8 +89,30 @@ def precompute(
         scene.material if plays else None,
     )
     whole = lambda _: finished(scene, *project_all(_projection(scene)))
-    projected = _kept(folder, whole, inputs, lambda: _project(scene, progress or (lambda share: None)))
+    projected = _kept(
+        folder, whole, inputs, lambda: _project(scene, progress or (lambda share: None)), "radiance transfer", report
+    )
     return dataclasses.replace(scene, radiance_transfer=transfer.with_projected(projected))
+
+
+def as_precomputed(scene: Scene) -> Scene:
+    """A scene of the same structure as `precompute` makes of it, at once and with zeros for what it computes: for `jvr.plan`."""
+    if scene.environment is None:
+        return scene
+    order = scene.environment.order
+
+    def shaped(scene: Scene) -> Any:
+        assert scene.material is not None
+        scene = dataclasses.replace(scene, material=scene.material.projected(order))
+        if scene.radiance_transfer is None or scene.radiance_transfer.is_frozen:
+            return scene.material, None
+        return scene.material, finished(scene, *project_all(_projection(scene)))
+
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(shaped, scene))
+    scene = dataclasses.replace(scene, material=zeros[0])
+    if zeros[1] is None:
+        return scene
+    return dataclasses.replace(scene, radiance_transfer=transfer_of(scene).with_projected(zeros[1]))
 
 
 def _projection(scene: Scene) -> TransferProjection:
@@ -103,23 +147,37 @@ def _project(scene: Scene, progress: Progress) -> ProjectedTransfer:
 _some = jax.jit(lambda projection, index: projection.nodes(index))
 
 
-def _kept(folder: Path | None, function: Callable[[Any], Any], inputs: Any, compute: Callable[[], Any]) -> Any:
+def _kept(
+    folder: Path | None,
+    function: Callable[[Any], Any],
+    inputs: Any,
+    compute: Callable[[], Any],
+    part: str,
+    report: Callable[[Precomputed], Any],
+) -> Any:
     """`compute()`, from the folder where it holds a result of the same inputs, and kept there where it does not."""
-    if folder is None:
-        return compute()
+    began = time.perf_counter()
+    found = None if folder is None else _found(folder, function, inputs)
+    result = jax.block_until_ready(compute()) if found is None else found
+    if folder is not None and found is None:
+        with replacing(folder / f"{_digest(inputs)}.npz") as temporary, temporary.open("wb") as file:
+            np.savez(file, *[np.asarray(x) for x in jax.tree.leaves(result)])
+    nbytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(result))
+    report(Precomputed(part, time.perf_counter() - began, found is not None, nbytes))
+    return result
+
+
+def _found(folder: Path, function: Callable[[Any], Any], inputs: Any) -> Any:
+    """What the folder holds of `function(inputs)`, or `None`."""
     leaves, structure = jax.tree.flatten(jax.eval_shape(function, inputs))
-    path = folder / f"{_digest(inputs)}.npz"
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(folder / f"{_digest(inputs)}.npz", allow_pickle=False) as file:
             arrays = [file[f"arr_{i}"] for i in range(len(leaves))]
         if all(a.shape == x.shape and a.dtype == x.dtype for a, x in zip(arrays, leaves, strict=True)):
             return jax.tree.unflatten(structure, [jnp.asarray(a) for a in arrays])
     except (FileNotFoundError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
         pass  # not there, or damaged: it is made anew
-    result = compute()
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, *[np.asarray(x) for x in jax.tree.leaves(result)])
-    return result
+    return None
 
 
 def _digest(inputs: Any) -> str:

@@ -33,12 +33,13 @@ def numbers(
     return BeforeValidator(check)
 
 
-def whole(what: str, low: int) -> BeforeValidator:
-    """A whole number of at least `low`."""
+def whole(what: str, low: int, high: int | None = None) -> BeforeValidator:
+    """A whole number of at least `low` and at most `high`."""
 
     def check(value: Any) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or value < low:
-            raise problem(f"must be a whole number of at least {low} ({what}), not {shown(value)}")
+        if isinstance(value, bool) or not isinstance(value, int) or value < low or (high is not None and value > high):
+            wanted = f"of at least {low}" if high is None else f"from {low} to {high}"
+            raise problem(f"must be a whole number {wanted} ({what}), not {shown(value)}")
         return value
 
     return BeforeValidator(check)

@@ -74,12 +74,13 @@ def key_of(loc: Sequence[int | str], data: Any, last: str | None = None) -> str:
             if isinstance(data, list):
                 key, data = f"{key}[{part}]", data[part]
             continue
-        found = isinstance(data, dict) and part in data
-        if not found and not skipped and _is_alternative(part, data):
-            skipped = True
+        # A kind may have the name of a key, but comes before the keys.
+        if not skipped and _is_alternative(part, data):
+            # An alternative in parentheses may hold a kind of table.
+            skipped = not part.startswith("(")
             continue
         skipped = False
-        key, data = f"{key}.{part}", data[part] if found else None
+        key, data = f"{key}.{part}", data[part] if isinstance(data, dict) and part in data else None
     return (key + (f".{last}" if last else "")).lstrip(".")
 
 

@@ -77,8 +77,8 @@ def light_parts(config: Config, transfer: AbstractTransfer) -> dict[str, Any]:
 
 def graded(volume: Volume, parts: dict[str, Any], transfer: AbstractTransfer) -> Volume:
     """The volume with gradients at its voxels, where precomputed ones are asked for."""
-    normals, scattering = parts.get("normals"), parts.get("scattering")
-    asked = "shading" in parts or transfer.takes_gradient or (scattering is not None and scattering.needs_gradient)
+    normals, others = parts.get("normals"), [parts[name] for name in ("scattering", "material") if name in parts]
+    asked = "shading" in parts or transfer.takes_gradient or any(part.needs_gradient for part in others)
     return volume.graded() if asked and isinstance(normals, PrecomputedGradient) and not normals.of_opacity else volume
 
 
@@ -134,11 +134,12 @@ def _scattering(config: Config, table: ScatteringTable) -> AbstractScattering:
     keywords = _keywords(table)
     if table.phase is not None:
         with blame(config.where("scattering.phase"), "scattering.phase"):
-            keywords["phase"] = _phase(config, "scattering.phase", table.phase)
+            keywords["phase"] = phase_of(config, "scattering.phase", table.phase)
     return SingleScattering(**keywords)
 
 
-def _phase(config: Config, key: str, table: AnyPhase) -> Any:
+def phase_of(config: Config, key: str, table: AnyPhase) -> Any:
+    """The phase function of a table."""
     from jvr.model import mie, phase
 
     kinds = {
@@ -153,7 +154,7 @@ def _phase(config: Config, key: str, table: AnyPhase) -> Any:
     if isinstance(table, TabulatedTable):
         return mie.TabulatedPhase(np.radians(table.degrees), table.values)
     if isinstance(table, MixtureTable):
-        phases = _each(config, f"{key}.phases", table.phases, lambda t, k: (_phase(config, k, t),))
+        phases = _each(config, f"{key}.phases", table.phases, lambda t, k: (phase_of(config, k, t),))
         return phase.Mixture(phases, table.weights)
     return kinds[table.kind]() if isinstance(table, EvenTable) else kinds[table.kind](**_keywords(table))
 

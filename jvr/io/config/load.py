@@ -15,7 +15,7 @@ from jvr.io.config.schema.whole import ConfigTable
 
 Override = tuple[str, Any]
 # Tables whose values may be others where a fit starts.
-INITIAL = ("lights", "shading", "scattering", "background")
+INITIAL = ("lights", "shading", "scattering", "background", "environment", "material", "radiance_transfer")
 # Keys of one table that exclude each other.
 ALTERNATIVES = {"path": "builtin", "fov_y": "half_angle_tangent", "opacity": "sigma_t"}
 ALTERNATIVES |= {b: a for a, b in ALTERNATIVES.items()}
@@ -111,7 +111,8 @@ def started(config: Config) -> Config:
 def _leaves(table: dict[str, Any], prefix: str = "") -> Iterator[Override]:
     for key, value in table.items():
         path = prefix + key.replace("[", ".").replace("]", "")
-        if isinstance(value, dict):
+        # A table that names its kind takes the place of the whole table that was there.
+        if isinstance(value, dict) and "kind" not in value:
             yield from _leaves(value, f"{path}.")
         else:
             yield path, value

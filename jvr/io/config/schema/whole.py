@@ -7,6 +7,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
 from jvr.io.config.schema.light import Lights, Normals, ScatteringTable, Shading, Shadows, casts_shadows
+from jvr.io.config.schema.natural import Environments, Material, RadianceTransferTable
 from jvr.io.config.schema.table import Angle, Colour, Extinction, Length, Pixels, Position, Range, Scalar, Table, named
 from jvr.io.config.schema.transfer import TransferTable
 
@@ -217,6 +218,9 @@ class ConfigTable(Table):
     shadows: Shadows | None = None
     scattering: ScatteringTable | None = None
     normals: Normals | None = None
+    environment: Environments = Field(default=[])
+    material: Material | None = None
+    radiance_transfer: RadianceTransferTable | None = None
     camera: Cameras = Field(default=[PerspectiveTable(kind="perspective")])
     settings: SettingsTable = SettingsTable()
     fit: FitTable | None = None
@@ -228,6 +232,14 @@ class ConfigTable(Table):
             raise problem('there is no light that casts them; add [[lights]] with kind = "directional", or "point"', "shadows")
         if self.shadows is not None and self.shading is None and self.scattering is None:
             raise problem("nothing shows them; add [shading] or [scattering]", "shadows")
+        if self.environment and self.material is None:
+            raise problem('nothing shows it; add [material], such as kind = "lambert"', "environment")
+        if self.material is not None and not self.environment:
+            raise problem(
+                'it shows light from all around; add [environment] with kind = "image", "constant" or "disc"', "material"
+            )
+        if self.radiance_transfer is not None and not self.environment:
+            raise problem("it is that of light from all around; add [environment] and [material]", "radiance_transfer")
         if fit is None and self.transfer is None and self.truth is None:
             raise problem('missing; add a table such as [transfer] kind = "window"', "transfer")
         if fit is None:

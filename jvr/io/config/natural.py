@@ -1,0 +1,168 @@
+"""From tables to environments, materials and radiance transfer, and what of them a fit may compute beforehand."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jvr.io.config.errors import blame
+from jvr.io.config.light import phase_of
+from jvr.io.config.load import Config
+from jvr.io.config.schema.natural import (
+    AnyEnvironment,
+    AnyMaterial,
+    DipoleTable,
+    ImageTable,
+    MaterialsTable,
+    MerlTable,
+    PhaseMaterialTable,
+    RadianceTransferTable,
+    RotationTable,
+)
+from jvr.model.effects import AbstractMaterial
+from jvr.model.environment import EnvironmentLight
+from jvr.model.scene import Scene
+
+Prepare = Callable[..., Scene]
+
+
+def natural_parts(config: Config) -> dict[str, Any]:
+    """What a configuration says about light from all around, as keywords of `jvr.Scene`."""
+    tables, parts = config.tables, {}
+    if tables.environment:
+        several = len(tables.environment) > 1
+        keys = [f"environment[{i}]" if several else "environment" for i in range(len(tables.environment))]
+        lights = [_environment(config, key, table) for key, table in zip(keys, tables.environment, strict=True)]
+        parts["environment"] = sum(lights[1:], lights[0])
+        if tables.material is not None:
+            parts["material"] = _material(config, tables.material, parts["environment"].order)
+    if tables.radiance_transfer is not None:
+        with blame(config.where("radiance_transfer"), "radiance_transfer"):
+            parts["radiance_transfer"] = _radiance_transfer(config, tables.radiance_transfer)
+    return parts
+
+
+def precomputed(scene: Scene, **keywords: Any) -> Scene:
+    """`jvr.precompute`, which is imported for scenes alone that have light from all around."""
+    if scene.environment is None:
+        return scene
+    from jvr.io.precompute import precompute
+
+    return precompute(scene, **keywords)
+
+
+def keeps_transfer(config: Config) -> bool:
+    """Whether a fit keeps the radiance transfer of its start though its unknowns change it."""
+    table = config.tables.radiance_transfer
+    return table is not None and table.frozen and _fits(config, *_shapes_transfer(table))
+
+
+def _shapes_transfer(table: RadianceTransferTable) -> tuple[str, ...]:
+    """Parts of the scene that radiance transfer is computed from."""
+    return ("transfer", "volume", "clipping", *(["material"] if table.bleeding == "material" else []))
+
+
+def fit_scene(config: Config, scene: Scene, prepare: Prepare) -> Scene:
+    """The scene that a fit starts from, with all computed beforehand that the fit does not change, or keeps as it is at its start."""
+    keep = {"keep_material": _fits(config, "material"), "keep_unscattered": _fits(config, "radiance_transfer")}
+    transfer, table = scene.radiance_transfer, config.tables.radiance_transfer
+    if table is None or table.frozen or not _fits(config, *_shapes_transfer(table)):
+        return prepare(scene, **keep)
+    return dataclasses.replace(prepare(dataclasses.replace(scene, radiance_transfer=None), **keep), radiance_transfer=transfer)
+
+
+def _fits(config: Config, *parts: str) -> bool:
+    """Whether an unknown lies in one of these parts of the scene."""
+    fit = config.tables.fit
+    return fit is not None and any(name.replace("[", ".").split(".")[0] in parts for name in fit.unknowns)
+
+
+def _environment(config: Config, key: str, table: AnyEnvironment) -> EnvironmentLight:
+    keywords = table.given()
+    rotation, clamped = keywords.pop("rotation"), keywords.pop("clamped", True)
+    with blame(config.where(key), key):
+        if isinstance(table, ImageTable):
+            keywords.pop("source", None)
+            found = config.find(keywords.pop("path"), f"{key}.path", table.source)
+            with blame(config.where(f"{key}.path"), f"{key}.path"):
+                light = EnvironmentLight.from_image(found, **keywords)
+        else:
+            light = (EnvironmentLight.constant if table.kind == "constant" else EnvironmentLight.disc)(**keywords)
+        light = EnvironmentLight(light.coefficients, clamped=clamped)
+        return light.rotated(_rotation(rotation)) if rotation else light
+
+
+def _rotation(turns: list[RotationTable]) -> np.ndarray:
+    """The matrix of turns, the first one made first."""
+    matrix = np.eye(3)
+    for turn in turns:
+        x, y, z = np.asarray(turn.axis) / np.linalg.norm(turn.axis)
+        cross, angle = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.radians(turn.degrees)
+        # Rodrigues' formula.
+        matrix = (np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross) @ matrix
+    return matrix
+
+
+def _material(config: Config, table: AnyMaterial | MaterialsTable, order: int) -> AbstractMaterial:
+    if not isinstance(table, MaterialsTable):
+        return _one_material(config, "material", table, order, table.threshold)
+    from jvr.model.material import MaterialByValue
+
+    threshold = table.materials[0].threshold
+    parts = [_one_material(config, f"material.materials[{i}]", m, order, threshold) for i, m in enumerate(table.materials)]
+    with blame(config.where("material"), "material"):
+        made = MaterialByValue(table.positions, parts)
+        # Materials that have no place beside each other say so when they are joined.
+        made.projected(0)
+        return made
+
+
+def _one_material(config: Config, key: str, table: AnyMaterial, order: int, threshold: float | None) -> AbstractMaterial:
+    with blame(config.where(key), key):
+        brdf = _brdf(config, key, table)
+        if threshold is None:
+            return brdf
+        from jvr.model.material import HarmonicMaterial
+
+        return HarmonicMaterial.project(brdf, order, threshold=threshold)
+
+
+def _brdf(config: Config, key: str, table: AnyMaterial) -> Any:
+    from jvr.model import brdf
+
+    keywords = {name: value for name, value in table.given().items() if name not in ("threshold", "source")}
+    if isinstance(table, MerlTable):
+        from jvr.model.merl import MerlBRDF
+
+        with blame(config.where(f"{key}.path"), f"{key}.path"):
+            return MerlBRDF.read(config.find(table.path, f"{key}.path", table.source))
+    if isinstance(table, PhaseMaterialTable):
+        with blame(config.where(f"{key}.phase"), f"{key}.phase"):
+            keywords["phase"] = phase_of(config, f"{key}.phase", table.phase)
+        return brdf.PhaseBRDF(**keywords)
+    if table.kind == "microfacet":
+        from jvr.model.microfacet import MicrofacetBRDF
+
+        return MicrofacetBRDF(**keywords)
+    return {"lambert": brdf.LambertBRDF, "phong": brdf.PhongBRDF, "blinn-phong": brdf.BlinnPhongBRDF}[table.kind](**keywords)
+
+
+def _radiance_transfer(config: Config, table: RadianceTransferTable) -> Any:
+    from jvr.effects.radiance_transfer import MaterialBleeding, RadianceTransfer, TransferBleeding
+
+    keywords = table.given()
+    keywords.pop("frozen")
+    if table.bleeding is not None:
+        keywords["bleeding"] = TransferBleeding() if table.bleeding == "transfer" else MaterialBleeding()
+    if table.scattering is not None:
+        key = "radiance_transfer.scattering"
+        with blame(config.where(key), key):
+            keywords["scattering"] = _dipole(table.scattering)
+    return RadianceTransfer(**keywords)
+
+
+def _dipole(table: DipoleTable) -> Any:
+    from jvr.model.dipole import Dipole
+
+    return Dipole(**table.given()) if table.preset is None else Dipole.preset(table.preset)

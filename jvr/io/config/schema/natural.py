@@ -1,0 +1,206 @@
+"""Tables of light from all around: environments, materials, radiance transfer.
+
+A parameter that is left out has the default of its class in jvr.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+
+from jvr.io.config.checks import number, number_or_triple, numbers, problem, whole
+from jvr.io.config.schema.light import Phase
+from jvr.io.config.schema.table import Position, Positions, Steepness, Table, named
+
+Radiance = Annotated[Any, number_or_triple("radiance", 0.0)]
+Order = Annotated[int, whole("order of the harmonics", 0, 10)]
+Share = Annotated[Any, number_or_triple("share of the light", 0.0, 1.0)]
+Fraction = Annotated[float, number("from 0 for none to 1 for all", 0.0, 1.0)]
+
+
+class RotationTable(Table):
+    """A turn about an axis of the world, counter-clockwise when the axis points to the viewer."""
+
+    axis: Position
+    degrees: Annotated[float, number("angle in degrees")]
+
+    @model_validator(mode="after")
+    def _check(self) -> "RotationTable":
+        if not any(self.axis):
+            raise problem("must be a direction, such as [0, 0, 1], not zero", "axis")
+        return self
+
+
+def _one_or_more(value: Any) -> Any:
+    return value if isinstance(value, list) else [value]
+
+
+Rotations = Annotated[list[RotationTable], BeforeValidator(_one_or_more)]
+
+
+class AroundTable(Table):
+    """What all environments have: how they are turned, one turn after the other."""
+
+    rotation: Rotations = Field(default=[])
+    clamped: bool | None = None
+
+
+class ImageTable(AroundTable):
+    """`jvr.EnvironmentLight.from_image`."""
+
+    kind: Literal["image"]
+    path: str
+    source: str | None = None
+    order: Order | None = None
+    window: Annotated[float, number("band from which nothing is left", 0.0, inner=True)] | None = None
+
+
+class ConstantTable(AroundTable):
+    """`jvr.EnvironmentLight.constant`."""
+
+    kind: Literal["constant"]
+    radiance: Radiance | None = None
+    order: Order | None = None
+
+
+class RoundTable(AroundTable):
+    """`jvr.EnvironmentLight.disc`."""
+
+    kind: Literal["disc"]
+    towards: Annotated[list[float], numbers(3, "x, y, z, from the scene to the light")]
+    half_angle: Annotated[float, number("degrees from the middle to the rim", 0.0, 180.0)]
+    radiance: Radiance | None = None
+    order: Order | None = None
+
+
+def _environments(value: Any) -> Any:
+    """One table or name, or a list of them."""
+    return [named(table) for table in _one_or_more(value)]
+
+
+AnyEnvironment = ImageTable | ConstantTable | RoundTable
+Environments = Annotated[list[Annotated[AnyEnvironment, Field(discriminator="kind")]], BeforeValidator(_environments)]
+
+
+class OneMaterialTable(Table):
+    """What all materials have. With a threshold they are projected on harmonics when the file is read."""
+
+    threshold: Steepness | None = None
+
+
+class LambertBRDFTable(OneMaterialTable):
+    """`jvr.LambertBRDF`."""
+
+    kind: Literal["lambert"]
+    reflectance: Share | None = None
+
+
+class PhongBRDFTable(OneMaterialTable):
+    """`jvr.PhongBRDF` or `jvr.BlinnPhongBRDF`."""
+
+    kind: Literal["phong", "blinn-phong"]
+    diffuse: Share | None = None
+    specular: Share | None = None
+    exponent: Annotated[float, number("exponent of the highlight", 0.0)] | None = None
+
+
+class MicrofacetTable(OneMaterialTable):
+    """`jvr.MicrofacetBRDF`."""
+
+    kind: Literal["microfacet"]
+    base: Share | None = None
+    metallic: Fraction | None = None
+    roughness: Annotated[float, number("0.001 for a mirror, 1 for matte", 0.001, 1.0)] | None = None
+    reflectance_at_normal: Share | None = None
+
+
+class PhaseMaterialTable(OneMaterialTable):
+    """`jvr.PhaseBRDF`."""
+
+    kind: Literal["phase"]
+    phase: Phase
+    albedo: Share | None = None
+
+
+class MerlTable(OneMaterialTable):
+    """`jvr.MerlBRDF.read`."""
+
+    kind: Literal["merl"]
+    path: str
+    source: str | None = None
+
+
+AnyMaterial = LambertBRDFTable | PhongBRDFTable | MicrofacetTable | PhaseMaterialTable | MerlTable
+OneMaterial = Annotated[AnyMaterial, Field(discriminator="kind"), BeforeValidator(named)]
+
+
+class MaterialsTable(Table):
+    """`jvr.MaterialByValue`."""
+
+    positions: Annotated[Positions, Field(min_length=1)]
+    materials: list[OneMaterial]
+
+    @model_validator(mode="after")
+    def _check(self) -> "MaterialsTable":
+        self._same_length("positions", "materials")
+        if any(material.threshold is not None for material in self.materials[1:]):
+            raise problem("all materials have the threshold of the first: give it there", "materials")
+        return self
+
+
+def _kind_of_material(value: Any) -> str:
+    by_value = isinstance(value, MaterialsTable) or (isinstance(value, dict) and {"positions", "materials"} & set(value))
+    return "(by value)" if by_value else "(one)"
+
+
+Material = Annotated[
+    Annotated[OneMaterial, Tag("(one)")] | Annotated[MaterialsTable, Tag("(by value)")], Discriminator(_kind_of_material)
+]
+
+
+class DipoleTable(Table):
+    """`jvr.Dipole`, or one of its presets."""
+
+    preset: str | None = None
+    sigma_s_prime: (
+        Annotated[list[float], numbers(3, "reduced scattering in 1 / mm, red, green, blue", 0.0, inner=True)] | None
+    ) = None
+    sigma_a: Annotated[list[float], numbers(3, "absorption in 1 / mm, red, green, blue", 0.0)] | None = None
+    eta: Annotated[float, number("index of refraction", 1.0, 3.0)] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "DipoleTable":
+        self._one_of("preset", "sigma_s_prime")
+        if self.preset is not None and (self.sigma_a is not None or self.eta is not None):
+            raise problem("excludes sigma_a and eta: a preset has its own", "preset")
+        if self.sigma_s_prime is not None and self.sigma_a is None:
+            raise problem("missing; give sigma_a beside sigma_s_prime", "sigma_a")
+        return self
+
+
+def _dipole(value: Any) -> Any:
+    return {"preset": value} if isinstance(value, str) else value
+
+
+class RadianceTransferTable(Table):
+    """`jvr.RadianceTransfer`. `frozen`: whether a fit keeps what was computed for its start though its unknowns change it."""
+
+    order: Order | None = None
+    rays: Annotated[int, whole("rays for each node", 1)] | None = None
+    resolution: Annotated[float, number("nodes for each voxel along an axis", 0.0, 1.0)] | None = None
+    bleeding: Literal["transfer", "material"] | None = None
+    scattering: Annotated[DipoleTable, BeforeValidator(_dipole)] | None = None
+    neighbourhood: Annotated[float, number("radius as a share of the longest side", 0.0, 1.0)] | None = None
+    exact: bool | None = None
+    chromaticity: Order | None = None
+    step: Annotated[float, number("first step in voxels", 0.0, inner=True)] | None = None
+    growth: Annotated[float, number("ratio of a step to the one before", 1.0)] | None = None
+    termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", 0.0, 0.999)] | None = None
+    surface: Annotated[float, number("change of transparency between nodes", 0.0, inner=True)] | None = None
+    memory: Annotated[float, number("bytes", 0.0, inner=True)] | None = None
+    frozen: bool = True
+
+    @model_validator(mode="after")
+    def _check(self) -> "RadianceTransferTable":
+        if self.chromaticity is not None and self.bleeding is None:
+            raise problem('is for light with a colour: add bleeding = "transfer" or "material"', "chromaticity")
+        return self
