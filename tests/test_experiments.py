@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jvr
-from experiments import contact_sheet, phase_recovery, shadowed_fit
+from experiments import contact_sheet, phase_recovery, relight, shadowed_fit
 from jvr.io.config import build_fit, build_scene, read_config
 
 
@@ -77,6 +77,20 @@ def test_errors_of_a_table_are_relative_to_the_true_one():
     assert found == pytest.approx({"extinction": 0.1, "largest_extinction": 0.15, "colour": 0.1}, rel=1e-5)
 
 
+def test_the_head_and_its_maps_have_their_up_and_front_where_the_world_has_them(embedded):
+    """Axes are a rotation, and a map's light from above and from its centre comes from there in the world."""
+    of = relight.study(quick=True)
+    np.testing.assert_allclose(np.linalg.det(of.axes), 1.0, rtol=1e-6)
+    bright = np.zeros((16, 32, 3))
+    bright[:2] = 1.0  # above
+    above = of._replace(maps=(bright, bright)).light(0, 2).radiance(np.array([[0.0, 0, 1], [0, 0, -1]]))
+    assert above[0, 0] > above[1, 0] + 0.1
+    bright = np.zeros((16, 32, 3))
+    bright[6:10, 14:18] = 1.0  # the centre: the front, where the first camera is
+    front = of._replace(maps=(bright, bright)).light(0, 2).radiance(np.array([[0.0, -1, 0], [0, 1, 0]]))
+    assert front[0, 0] > front[1, 0] + 0.05
+
+
 @pytest.mark.parametrize("name", ["shadowed_fit.toml", pytest.param("real/shadowed_fit.toml", marks=pytest.mark.slow)])
 def test_configurations_of_the_shadowed_fit_describe_the_same_experiment(name, request):
     if name.startswith("real"):
@@ -111,3 +125,14 @@ def test_the_fit_with_and_without_shadows_runs(embedded, monkeypatch, tmp_path):
     assert size > 10_000
     scores = {row["model"]: row for row in result["table"]}
     assert scores["with shadows"]["fitted_psnr"] > scores["without shadows"]["fitted_psnr"]
+
+
+@pytest.mark.slow
+def test_relighting_runs(monkeypatch, tmp_path):
+    result, size = ran(relight, monkeypatch, tmp_path)
+    assert size > 10_000
+    rows = {row["model"]: row for row in result["table"]}
+    exact, without = rows["exact product"], rows["no transfer"]
+    assert exact["determined"] == 12
+    assert exact["coefficients"] < without["coefficients"]
+    assert all(exact[key]["psnr"] > without[key]["psnr"] for key in ("held_out", "relit"))

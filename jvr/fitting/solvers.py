@@ -22,6 +22,8 @@ from jvr.types import Outcome
 
 # With so many rejected steps in a row no descent direction is left that float32 can tell apart.
 MOST_REJECTIONS = 12
+# A rejected step that promised less than this share of what ends a fit was not worth another try.
+LEAST_PROMISE = 1e-3
 
 
 class Functions(NamedTuple):
@@ -118,7 +120,10 @@ class ChunkedLeastSquares(AbstractSolver):
         if accept:
             return self._accepted(functions, state, trial, loss, normal, step_size)
         state = state._replace(step_size=np.asarray(step_size), rejections=state.rejections + 1)
-        if state.rejections < MOST_REJECTIONS:
+        # At the bottom what a step promises is less than the rounding of the objective, which then decides about it.
+        promised = -float(model[1] @ move + 0.5 * move @ scaled @ move)
+        at_bottom = finite and promised < LEAST_PROMISE * self.rtol * float(state.loss)
+        if state.rejections < MOST_REJECTIONS and not at_bottom:
             return state
         return self._level_ended(functions, state, done=1 if finite else 2)
 
