@@ -55,6 +55,8 @@ def test_environments_of_a_list_are_summed():
 def test_an_environment_is_read_from_an_image(sky):
     found = scene_of(NATURAL, f"environment={{kind='image',path='{sky}',order=2,window=4.5}}").environment
     assert same(found, jvr.EnvironmentLight.from_image(sky, 2, window=4.5))
+    half = scene_of(NATURAL, f"environment={{kind='image',path='{sky}',scale=0.5}}").environment
+    np.testing.assert_allclose(half.coefficients, 0.5 * jvr.EnvironmentLight.from_image(sky).coefficients, rtol=1e-6)
 
 
 def test_an_environment_is_turned_about_its_axes_in_their_order():

@@ -179,7 +179,7 @@ def choose_unknowns(model: Exposed, select: Callable[[Exposed], Any], transforms
 
     Without `transforms` (a tuple, one for each array, `None` where the default is wanted), colours, albedo and weights get `Sigmoid()`,
     asymmetries `Sigmoid(-1, 1)`, extinction, heights, widths and what lights and surfaces have of strength `Softplus`, positions of
-    a table `Ordered`, directions `Direction`, anything else `Identity`.
+    a table `Ordered`, directions `Direction`, shares of a material `Sigmoid`, coefficients of a dipole `Softplus`, anything else `Identity`.
 
     **Raises** `ValueError` where an array is not one of the scene's, not floating point or named twice, or the number of transforms
     differs.
@@ -236,9 +236,22 @@ def _default_transform(name: str, value: Array, model: Exposed) -> AbstractTrans
         return Sigmoid()
     if field in ("sigma_t", "height"):
         return Softplus(1.0 / jnp.min(model.scene.volume.spacing))
-    if field in ("exposure", "ambient", "diffuse", "specular", "threshold"):
+    if name.startswith("scene.material") and field in (
+        "reflectance",
+        "base",
+        "metallic",
+        "reflectance_at_normal",
+        "diffuse",
+        "specular",
+    ):
+        return Sigmoid()
+    if field == "roughness":
+        return Sigmoid(1e-3, 1.0)
+    if field in ("exposure", "ambient", "diffuse", "specular", "threshold", "sigma_s_prime", "sigma_a"):
         return Softplus()
-    if field in ("irradiance", "intensity", "radiance", "shininess"):
+    if field == "eta":
+        return Sigmoid(1.0, 3.0)
+    if field in ("irradiance", "intensity", "radiance", "shininess", "exponent"):
         return Softplus(jnp.maximum(jnp.mean(value), 1e-3))
     if field in ("g", "g1", "g2", "k"):
         return Sigmoid(-1.0, 1.0)
