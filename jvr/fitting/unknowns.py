@@ -179,7 +179,8 @@ def choose_unknowns(model: Exposed, select: Callable[[Exposed], Any], transforms
 
     Without `transforms` (a tuple, one for each array, `None` where the default is wanted), colours, albedo and weights get `Sigmoid()`,
     asymmetries `Sigmoid(-1, 1)`, extinction, heights, widths and what lights and surfaces have of strength `Softplus`, positions of
-    a table `Ordered`, directions `Direction`, shares of a material `Sigmoid`, coefficients of a dipole `Softplus`, anything else `Identity`.
+    a table `Ordered`, directions `Direction`, shares of a material `Sigmoid`, coefficients of a dipole `Softplus`, anything else
+    `Identity`.
 
     **Raises** `ValueError` where an array is not one of the scene's, not floating point or named twice, or the number of transforms
     differs.
