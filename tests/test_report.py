@@ -399,8 +399,6 @@ def test_page_of_a_real_fit(tmp_path):
 
 def test_where_no_unknown_is_seen_the_page_says_so():
     """As after a fit whose light has become negative everywhere and is cut off."""
-    from jvr.report.page.words import worst_in_words
-
     transfer = jvr.LutTransfer([[0, 0, 0], [1, 1, 1]], [0, 1], [0, 1])
     words = worst_in_words((("material.albedo[]", 0.0), ("environment.coefficients[0, 0]", 0.0)), transfer)
     assert words == "No unknown changes the pictures."
