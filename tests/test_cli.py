@@ -345,3 +345,83 @@ def test_the_compilation_cache_lies_in_the_users_cache_folder(tmp_path, monkeypa
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "cache" / "jvr" / "xla")
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
+
+
+NATURAL = """
+[volume]
+builtin = "demo"
+[camera]
+kind = "fibonacci"
+count = 1
+width = 6
+height = 6
+[settings]
+step = 4.0
+[truth]
+kind = "linear"
+positions = [0.2, 0.5]
+rgb = [[0.9, 0.9, 0.9], [0.9, 0.5, 0.2]]
+sigma_t = [0.0, 0.2]
+[[environment]]
+kind = "constant"
+radiance = 0.5
+[[environment]]
+kind = "disc"
+towards = [0, 0, 1]
+half_angle = 30
+radiance = 3.0
+order = 1
+[material]
+kind = "phase"
+phase = "isotropic"
+[radiance_transfer]
+rays = 4
+order = 1
+resolution = 0.05
+[fit]
+unknowns = ["transfer.sigma_t"]
+max_steps = 2
+[fit.start]
+entries = 3
+sigma_t = 0.1
+domain = [0.0, 1.0]
+"""
+
+
+@pytest.fixture
+def cached(tmp_path, monkeypatch):
+    """A cache in the folder of the test, and none of compiled programs."""
+    monkeypatch.setenv("JVR_CACHE", "1")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    (tmp_path / "natural.toml").write_text(NATURAL)
+
+
+def test_what_is_computed_beforehand_is_said_and_kept(cached, tmp_path, capsys):
+    """By the second command it is read, and the picture is the same."""
+    pictures = []
+    for cached_before in (False, True):
+        assert cli.run(["render", "natural.toml", "-o", "a.exr", "--json"]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert [(p["part"], p["cached"]) for p in report["precomputed"]] == [
+            ("material", cached_before),
+            ("radiance transfer", cached_before),
+        ]
+        assert all(p["nbytes"] > 0 and p["seconds"] > 0 for p in report["precomputed"])
+        pictures.append(read_image(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(*pictures)
+    assert len(list((tmp_path / "cache" / "jvr" / "precomputed").iterdir())) == 2
+    assert cli.run(["render", "natural.toml", "-o", "a.png"]) == 0
+    assert "radiance transfer: read from the cache in" in capsys.readouterr().out
+    assert cli.run(["plan", "natural.toml"]) == 0
+    assert "computed beforehand" in capsys.readouterr().out
+
+
+def test_a_fit_with_a_kept_radiance_transfer_says_what_that_is_worth(cached, capfd):
+    assert cli.run(["fit", "natural.toml", "-o", "out"]) == 0
+    printed = capfd.readouterr()
+    assert "with the radiance transfer of what was found, not of the start: PSNR" in printed.out
+    assert "another transfer function" not in printed.err
+    report = json.loads(Path("out/result.json").read_text())
+    assert report["transfer_kept"]["mean_psnr"] < report["views"]["mean_psnr"]
+    assert {p["part"] for p in report["precomputed"]} == {"material", "radiance transfer"}

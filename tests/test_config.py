@@ -72,7 +72,7 @@ def refusal(text, *sets):
         ("[fit]\nloss = 'dssim'\n[truth]\nkind = 'window'", "fit.loss", "bfgs"),
         ("[fit]\nheld_out = -1\n[truth]\nkind = 'window'", "fit.held_out", "indices"),
         ("[fit.start]\nentries = 8\n[truth]\nkind = 'window'", "fit.start", "excludes [transfer]"),
-        ("[matter]\nx = 1", "matter", "known:"),
+        ("[weather]\nx = 1", "weather", "known:"),
     ],
 )
 def test_mistakes_in_a_table_are_named(text, key, hint):

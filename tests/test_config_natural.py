@@ -10,7 +10,7 @@ import pytest
 from test_config_light import BASE, config, refusal, same, scene_of
 
 import jvr
-from jvr.io.config import build_fit, build_scene
+from jvr.io.config import build_fit, build_scene, read_config
 from jvr.io.images import write_image
 
 NATURAL = 'environment = "constant"\nmaterial = "lambert"\n' + BASE
@@ -55,6 +55,8 @@ def test_environments_of_a_list_are_summed():
 def test_an_environment_is_read_from_an_image(sky):
     found = scene_of(NATURAL, f"environment={{kind='image',path='{sky}',order=2,window=4.5}}").environment
     assert same(found, jvr.EnvironmentLight.from_image(sky, 2, window=4.5))
+    half = scene_of(NATURAL, f"environment={{kind='image',path='{sky}',scale=0.5}}").environment
+    np.testing.assert_allclose(half.coefficients, 0.5 * jvr.EnvironmentLight.from_image(sky).coefficients, rtol=1e-6)
 
 
 def test_an_environment_is_turned_about_its_axes_in_their_order():
@@ -312,3 +314,43 @@ def test_a_white_furnace_is_white():
     camera = jvr.PerspectiveCamera.look_at((0.0, -200.0, 0.0), (0.0, 0.0, 0.0), (0, 0, 1), 5.0, 3, 3)
     picture = jvr.render(jvr.precompute(made), camera, jvr.Settings(1.0))
     assert math.isclose(float(jnp.max(jnp.abs(picture.rgb - 1))), 0, abs_tol=1e-3)
+
+
+# --- documentation ---------------------------------------------------------------------------------------------------
+
+PAGE = (Path(__file__).parents[1] / "docs" / "natural_light.md").read_text(encoding="utf-8")
+
+
+def test_the_config_of_the_documentation_is_valid():
+    made = scene_of(PAGE.split("```toml\n")[1].split("```")[0] + BASE)
+    assert isinstance(made.material, jvr.MaterialByValue)
+    assert made.environment.order == 3
+    assert isinstance(made.radiance_transfer.scattering, jvr.Dipole)
+
+
+def test_the_example_of_the_documentation_runs(sky, tmp_path, monkeypatch):
+    """With small files in place of the named ones, and a small picture."""
+    monkeypatch.chdir(tmp_path)
+    values = np.random.default_rng(0).uniform(-500, 1500, (6, 7, 8)).astype(np.float32)
+    np.save(tmp_path / "head.npy", values)
+    code = PAGE.split("```python\n")[1].split("```")[0]
+    for name, other in (
+        ("head.nii.gz", "head.npy"),
+        ("potsdamer_platz_1k.hdr", "sky.exr"),
+        ("studio_small_03_1k.hdr", "sky.exr"),
+        ("128, 128", "4, 4"),
+    ):
+        assert name in code
+        code = code.replace(name, other)
+    found = {}
+    exec(code, found)
+    assert np.all(np.isfinite(found["relit"].rgb))
+    assert np.any(np.asarray(found["relit"].rgb) != np.asarray(found["image"].rgb))
+
+
+@pytest.mark.parametrize("name", ["natural_light.toml", "real/ct_head_natural.toml"])
+def test_the_configurations_are_valid(name, request, monkeypatch):
+    if name.startswith("real"):
+        monkeypatch.setenv("JVR_DATA", str(request.getfixturevalue("data")))
+    made = build_scene(read_config(Path(__file__).parents[1] / "configs" / name))
+    assert made.radiance_transfer is not None

@@ -15,6 +15,8 @@ import jvr
 from jvr.rendering.advise import effects_of, remarks_on
 
 MODULES = ("lighting", "shading", "scattering", "shadow_rays", "shadow_volume", "shadow_map", "deep_shadow_map", "light_space")
+MODULES += ("natural_light", "radiance_transfer", "transfer_grid", "diffusion")
+MODELS = ("material", "brdf", "microfacet", "merl", "dipole")
 LIGHT = {"lights": (jvr.DirectionalLight((0.3, -0.5, -1.0)), jvr.AmbientLight(0.2))}
 EFFECTS = {
     "shading": lambda: {"shading": jvr.BlinnPhong()},
@@ -22,10 +24,24 @@ EFFECTS = {
     "shadows": lambda: {"shading": jvr.Lambert(), "shadows": jvr.ShadowVolume(1.0)},
     "gradient": lambda: {"transfer": jvr.GradientOpacity(transfer(), 0.01, 0.3)},
 }
+# Light from all around in the air, on surfaces, and in the way of each other; each met once by every other effect.
+NATURAL = {
+    "haze": lambda: around(jvr.PhaseBRDF(jvr.HenyeyGreenstein(0.4), 0.9)),
+    "surfaces": lambda: around(jvr.LambertBRDF(0.8)),
+    "radiance_transfer": lambda: around(
+        jvr.LambertBRDF(0.8), radiance_transfer=jvr.RadianceTransfer(1, 4, bleeding=jvr.TransferBleeding())
+    ),
+}
+PAIRS = [*itertools.combinations(EFFECTS, 2), *zip(("haze", "surfaces", "radiance_transfer", "haze"), EFFECTS, strict=True)]
 
 
 def transfer(scale=0.6):
     return jvr.LinearTransfer([0.1, 0.5, 0.9], [[0.9, 0.5, 0.2], [0.2, 0.8, 0.4], [0.7, 0.7, 0.9]], [0.0, 0.2 * scale, scale])
+
+
+def around(material, **parts):
+    """Parts of a scene under light from all around."""
+    return {"environment": jvr.EnvironmentLight.constant(0.7, order=1), "material": material, **parts}
 
 
 def scene(**parts):
@@ -41,7 +57,7 @@ def program(one):
 BLOCKED = """
 import sys
 for name in {modules}:
-    sys.modules["jvr.effects." + name] = None  # importing it raises ImportError
+    sys.modules[name] = None  # importing it raises ImportError
 sys.path.insert(0, {tests!r})
 from test_effects import program, scene
 print(program(scene()))
@@ -51,7 +67,8 @@ print(program(scene()))
 def test_scene_without_effects_needs_none_of_their_modules():
     """The same program when no module of an effect can be imported."""
     folder = str(__file__).rsplit("/", 1)[0]
-    code = BLOCKED.format(modules=MODULES, tests=folder)
+    modules = [f"jvr.effects.{name}" for name in MODULES] + [f"jvr.model.{name}" for name in MODELS]
+    code = BLOCKED.format(modules=modules, tests=folder)
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, encoding="utf-8")
     assert run.returncode == 0, run.stderr
     # Addresses of functions are the only difference between two processes.
@@ -59,20 +76,22 @@ def test_scene_without_effects_needs_none_of_their_modules():
     assert clean(run.stdout) == clean(program(scene()))
 
 
-@pytest.mark.parametrize("names", [*[(n,) for n in EFFECTS], *itertools.combinations(EFFECTS, 2)])
+@pytest.mark.parametrize("names", [*[(n,) for n in (*EFFECTS, *NATURAL)], *PAIRS])
 def test_an_effect_is_in_the_program_only_where_the_scene_holds_it(names):
     """Plans and programs differ from the plain one by what is named; taking the effects out again restores both."""
-    parts = functools.reduce(lambda a, b: a | b, [EFFECTS[name]() for name in names], dict(LIGHT))
+    parts = functools.reduce(lambda a, b: a | b, [(EFFECTS | NATURAL)[name]() for name in names], dict(LIGHT))
     lit, plain = scene(**parts), scene()
     assert program(lit) != program(plain)
     assert jvr.plan(lit) != jvr.plan(plain)
     absent = {"lights": (), "shading": None, "shadows": None, "scattering": None, "transfer": transfer()}
+    absent |= {"environment": None, "material": None, "radiance_transfer": None}
     restored = jvr.Scene(lit.volume, **absent)
     assert program(restored) == program(plain)
     assert jvr.plan(restored) == jvr.plan(plain)
-    included = {part.name for part in jvr.plan(lit).parts if part.included}
+    included = {part.name.replace(" ", "_") for part in jvr.plan(lit).parts if part.included}
     assert set(parts) - {"lights", "transfer"} <= included
-    assert ("gradient" in included) == any(name != "scattering" for name in names)
+    assert ("gradient" in included) == any(name not in ("scattering", "haze") for name in names)
+    assert ("radiance_transfer" in included) == ("radiance_transfer" in names)
 
 
 def test_lights_that_nothing_shows_are_not_in_the_program():
@@ -106,12 +125,43 @@ def test_new_numbers_compile_nothing():
     assert len(count) == 2
 
 
+def test_new_numbers_of_natural_light_compile_nothing():
+    """Light, material, dipole and transfer function; also once all has been computed beforehand."""
+    count = []
+
+    @jax.jit
+    def picture(one, camera):
+        count.append(1)
+        return jvr.render(one, camera).rgb
+
+    def natural(x):
+        bled = jvr.RadianceTransfer(1, 4, bleeding=jvr.TransferBleeding(), scattering=jvr.Dipole([x] * 3, [0.1] * 3))
+        light = jvr.EnvironmentLight.constant(x, order=1).rotated(np.array([[0, x, 0], [-x, 0, 0], [0, 0, x]]) / x)
+        made = around(jvr.LambertBRDF(x), radiance_transfer=bled) | {"environment": light}
+        return scene(transfer=transfer(x), **made)
+
+    from jvr.io.precompute import as_precomputed
+
+    # What is not traced again is not compiled again.
+    for x in (0.5, 0.9):
+        picture.trace(natural(x), perspective(natural(x).volume))
+    assert len(count) == 1
+    for x in (0.5, 0.9):
+        frozen = jvr.precompute(natural(x))
+        picture.trace(frozen, perspective(frozen.volume))
+    assert len(count) == 2
+    assert jvr.plan(jvr.precompute(natural(0.5))) == jvr.plan(as_precomputed(natural(0.5)))
+
+
 def test_plan_says_what_effects_need():
     parts = {p.name: p for p in jvr.plan(scene(**LIGHT, **EFFECTS["shadows"]())).parts}
     assert parts["shading"].needs == ("lights", "gradient")
     assert parts["shadows"].needs == ("light march",)
     assert "ShadowVolume(resolution=1) for 1 light" in parts["shadows"].reason
     assert "asked for by shading" in parts["gradient"].reason
+    parts = {p.name: p for p in jvr.plan(scene(**NATURAL["radiance_transfer"]())).parts}
+    assert parts["material"].needs == ("environment", "gradient")
+    assert "computed in each picture: jvr.precompute" in parts["radiance transfer"].reason
 
 
 def dark_scene():

@@ -395,3 +395,10 @@ def test_page_of_a_real_fit(tmp_path):
     _, page = make_page(tmp_path, result, targets=images, fitted=fitted, truth=truth)
     assert f"iterations {len(result.history)}" in page.text
     assert "±" in page.text
+
+
+def test_where_no_unknown_is_seen_the_page_says_so():
+    """As after a fit whose light has become negative everywhere and is cut off."""
+    transfer = jvr.LutTransfer([[0, 0, 0], [1, 1, 1]], [0, 1], [0, 1])
+    words = worst_in_words((("material.albedo[]", 0.0), ("environment.coefficients[0, 0]", 0.0)), transfer)
+    assert words == "No unknown changes the pictures."

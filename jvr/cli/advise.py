@@ -3,6 +3,7 @@
 import time
 from typing import Any
 
+from jvr.cli.beforehand import Beforehand
 from jvr.cli.inputs import BadInput, reading
 from jvr.cli.runtime import progress, provenance, use_compilation_cache
 from jvr.io.config import Config, build_cameras, build_scene, build_settings
@@ -15,9 +16,11 @@ def advise_on(config: Config, tolerance: float | None) -> tuple[Advice, dict[str
 
     use_compilation_cache()
     began = time.perf_counter()
+    beforehand = Beforehand()
     with reading():
         scene, settings = build_scene(config), build_settings(config)
         camera = build_cameras(config, scene.volume)[0]
+        scene = beforehand(scene)
     if settings.skipping:
         scene = eqx.tree_at(lambda s: s.volume, scene, scene.volume.bricked())
     with progress("measuring"), reading():
@@ -26,6 +29,7 @@ def advise_on(config: Config, tolerance: float | None) -> tuple[Advice, dict[str
         "picture_seconds": found.seconds,
         "contributions": [{"effect": c.effect, "rmse": c.rmse, "share": c.share} for c in found.contributions],
         "remarks": list(found.remarks),
+        "precomputed": beforehand.report,
         "seconds": time.perf_counter() - began,
         **provenance(),
     }

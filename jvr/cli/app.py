@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from jvr.cli.beforehand import lines_of
 from jvr.cli.inputs import BadInput, check_file_output, check_folder_output, check_image_output, load, reading
 
 HELP = "Differentiable volume rendering: pictures of scalar volumes, and transfer functions from pictures."
@@ -53,7 +54,7 @@ def render(
         if given.suffix.lower() == ".toml" or size is not None:
             config = _sized(config, size)
     report = render_pictures(config, output)
-    lines = [f"{path}" for path in report["outputs"]]
+    lines = [*report["outputs"], *lines_of(report["precomputed"])]
     _print(
         report, as_json, "\n".join([*lines, f"{report['seconds']:.2f} s, of which {report['compile_seconds']:.2f} s compiling"])
     )
@@ -67,7 +68,11 @@ def fit(
     sets: Set = None,
     as_json: Json = False,
 ) -> None:
-    """Find the transfer function (or other unknowns) that makes a volume look like the target images."""
+    """Find the transfer function (or other unknowns) that makes a volume look like the target images.
+
+    Radiance transfer is computed once, for the start of the fit, and kept though the transfer function may change, unless the configuration
+    says [radiance_transfer] frozen = false: then each evaluation computes it again, which is right and takes many times as long.
+    """
     from jvr.cli.fit import fit_scene
 
     with reading():
@@ -105,7 +110,7 @@ def tune(
         config = load(given, sets or [])
         check_file_output(output, "tuned.toml")
     report = tune_settings(config, output, error, seconds)
-    settings, lines = report["settings"], []
+    settings, lines = report["settings"], lines_of(report["precomputed"])
     for name in ("predicted", "measured"):
         lines.append(f"{name + ':':<11}RMSE {report[name]['rmse']:.2e}, {1e3 * report[name]['seconds']:.0f} ms")
     lines.append(f"step {settings['step']:g}, termination {settings['termination']:g}, {settings['quadrature']}: {output}")
@@ -134,12 +139,18 @@ def plan(
         from jvr.rendering.plan import plan as make_plan
 
         config = load(given, sets or [])
-        made = make_plan(build_scene(config), build_settings(config))
+        scene = build_scene(config)
+        if scene.environment is not None:
+            from jvr.io.precompute import as_precomputed
+
+            # The plan of what the other commands compile; it needs no numbers.
+            scene = as_precomputed(scene)
+        made = make_plan(scene, build_settings(config))
     parts = [{"name": p.name, "included": p.included, "reason": p.reason, "needs": list(p.needs)} for p in made.parts]
     report, text = {"command": "plan", "config": str(given), "parts": parts}, str(made)
     if measure or bound is not None:
         found, measured = advise_on(config, bound)
-        report, text = report | measured, f"{text}\n\n{found}"
+        report, text = report | measured, "\n".join([text, "", *lines_of(measured["precomputed"]), str(found)])
     _print(report, as_json, text)
 
 
@@ -211,9 +222,13 @@ def _sized(config: Any, size: int | None) -> Any:
 
 def _summary(report: dict[str, Any], output: Path) -> str:
     psnr = report["views"]["mean_psnr"]
-    lines = [f"{report['outcome']} after {len(report['history'])} steps, {report['seconds']:.1f} s; PSNR {psnr:.1f} dB"]
+    lines = lines_of(report["precomputed"])
+    lines += [f"{report['outcome']} after {len(report['history'])} steps, {report['seconds']:.1f} s; PSNR {psnr:.1f} dB"]
     if report["held_out"]["psnr"]:
         lines.append(f"held-out views: PSNR {report['held_out']['mean_psnr']:.1f} dB")
+    if report["transfer_kept"] is not None:
+        again = report["transfer_kept"]["mean_psnr"]
+        lines.append(f"with the radiance transfer of what was found, not of the start: PSNR {again:.1f} dB")
     return "\n".join([*lines, f"{output / report['page']}"])
 
 

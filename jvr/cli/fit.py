@@ -1,13 +1,17 @@
 """`jvr fit` and `jvr demo`: one folder with everything that a fit found."""
 
+import contextlib
 import json
 import shlex
 import time
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jvr.cli.beforehand import Beforehand
 from jvr.cli.inputs import BadInput, Interrupted, reading, refused_by_jvr
 from jvr.cli.runtime import nested, plain, progress, provenance, use_compilation_cache
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
@@ -27,16 +31,26 @@ def fit_scene(config: Config, folder: Path, *, resume: bool) -> dict[str, Any]:
     """Runs the fit of a configuration and writes pictures, transfer function, numbers and page into `folder`."""
     use_compilation_cache()
     began = time.perf_counter()
+    beforehand = Beforehand()
     checkpoint = folder / CHECKPOINT
     with reading(), progress("reading the volume and the target images"):
         if resume and not checkpoint.exists():
             raise BadInput(f"--resume: {checkpoint} does not exist; leave --resume out to start anew")
-        job = build_fit(config)
+        job = build_fit(config, prepare=beforehand)
     folder.mkdir(parents=True, exist_ok=True)
-    result = _fit(job, checkpoint, resume)
-    with progress("writing the results"):
-        report = _write(config, job, result, folder, began)
-    return report
+    with _about_the_kept_transfer(job):
+        result = _fit(job, checkpoint, resume)
+        with progress("writing the results"):
+            return _write(config, job, result, folder, began, beforehand)
+
+
+@contextlib.contextmanager
+def _about_the_kept_transfer(job: FitJob) -> Iterator[None]:
+    """No warnings that a transfer is kept which the configuration asks to keep."""
+    with warnings.catch_warnings():
+        if job.keeps_transfer:
+            warnings.filterwarnings("ignore", "the radiance transfer was computed for another", RuntimeWarning)
+        yield
 
 
 def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
@@ -56,7 +70,7 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
         raise BadInput(f"fit: {error}") from error
 
 
-def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float) -> dict[str, Any]:
+def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float, beforehand: Beforehand) -> dict[str, Any]:
     from jvr.io.images import replacing
 
     fitted = _pictures(result.scene, result.exposure, job.cameras, job)
@@ -67,11 +81,21 @@ def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float)
     for i, (target, found) in enumerate(zip(held_targets, held_fitted, strict=True)):
         _write_views(folder, f"held_out_{i:02d}", target, found)
     write_transfer(folder / "transfer.toml", result.scene.transfer)
-    report = _report(config, job, result, (fitted, held_fitted), time.perf_counter() - began)
+    report = _report(config, job, result, (fitted, held_fitted))
+    report["transfer_kept"] = _with_transfer_of_its_own(job, result, beforehand) if job.keeps_transfer else None
+    report |= {"precomputed": beforehand.report, "seconds": time.perf_counter() - began}
     with replacing(folder / "result.json") as temporary:
         temporary.write_text(json.dumps(report, allow_nan=False, indent=1), encoding="utf-8")
     _write_page(folder, config, job, result, fitted)
     return report
+
+
+def _with_transfer_of_its_own(job: FitJob, result: Any, beforehand: Beforehand) -> dict[str, Any]:
+    """How the result looks once its radiance transfer is its own and not that of the start."""
+    import equinox as eqx
+
+    scene = beforehand(eqx.tree_at(lambda s: s.radiance_transfer.projected, result.scene, None))
+    return _scores(job.targets, _pictures(scene, result.exposure, job.cameras, job))
 
 
 def _pictures(scene: Any, exposure: float, cameras: Any, job: FitJob) -> list[np.ndarray]:
@@ -109,7 +133,7 @@ def _write_page(folder: Path, config: Config, job: FitJob, result: Any, fitted: 
     )
 
 
-def _report(config: Config, job: FitJob, result: Any, pictures: Any, seconds: float) -> dict[str, Any]:
+def _report(config: Config, job: FitJob, result: Any, pictures: Any) -> dict[str, Any]:
     """The machine-readable object of a fit. What the images do not determine has the standard error `null`."""
     tables = config.tables
     held_targets = job.held_out[1] if job.held_out else ()
@@ -121,7 +145,6 @@ def _report(config: Config, job: FitJob, result: Any, pictures: Any, seconds: fl
         "fit": tables.fit.model_dump() if tables.fit else None,
         "outcome": result.outcome.value,
         "exposure": result.exposure,
-        "seconds": seconds,
         "fit_seconds": stats.seconds,
         "views": _scores(job.targets, pictures[0]),
         "held_out": _scores(held_targets, pictures[1]),

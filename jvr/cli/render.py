@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jvr.cli.beforehand import Beforehand
 from jvr.cli.inputs import BadInput, reading, refused_by_jvr
 from jvr.cli.runtime import plain, progress, provenance, use_compilation_cache
 from jvr.io.config import Config, build_cameras, build_scene, build_settings
@@ -15,9 +16,11 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
     """Renders every camera of a configuration: to `output`, or with several cameras to numbered files beside it."""
     use_compilation_cache()
     began = time.perf_counter()
+    beforehand = Beforehand()
     with reading():
         scene, settings = build_scene(config), build_settings(config)
         cameras = build_cameras(config, scene.volume)
+        scene = beforehand(scene)
     import equinox as eqx
     import jax
 
@@ -47,6 +50,7 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
         "pictures": pictures,
         "seconds": time.perf_counter() - began,
         "compile_seconds": compile_seconds,
+        "precomputed": beforehand.report,
         **provenance(),
     }
 

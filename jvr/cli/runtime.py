@@ -4,7 +4,7 @@ import contextlib
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -12,19 +12,30 @@ from typing import Any
 
 def use_compilation_cache() -> None:
     """Keeps compiled programs in the user's cache folder, so that the second run starts at once; `JVR_CACHE=0` turns it off."""
-    if os.environ.get("JVR_CACHE", "1") in ("0", "") or "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = root / "jvr" / "xla"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    folder = None if "JAX_COMPILATION_CACHE_DIR" in os.environ else cache_folder("xla")
+    if folder is None:
         return
     import jax
 
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def cache_folder(name: str) -> Path | None:
+    """A folder of the user's cache, or `None` where it cannot be used or `JVR_CACHE=0` turns it off."""
+    if os.environ.get("JVR_CACHE", "1") in ("0", ""):
+        return None
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jvr" / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return folder if os.access(folder, os.W_OK) else None
+
+
+# Signs of life that are moving now; a bar takes their place on the terminal.
+_moving: list[Any] = []
 
 
 @contextlib.contextmanager
@@ -35,8 +46,30 @@ def progress(message: str) -> Iterator[None]:
         return
     from rich.console import Console
 
-    with Console(stderr=True).status(message):
-        yield
+    with Console(stderr=True).status(message) as status:
+        _moving.append(status)
+        try:
+            yield
+        finally:
+            _moving.remove(status)
+
+
+@contextlib.contextmanager
+def bar(message: str) -> Iterator[Callable[[float], None]]:
+    """A function to call with the share that is done, 0 ... 1; it moves a bar on stderr where that is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda share: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    for status in _moving:
+        status.stop()
+    with Progress(console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(message, total=1.0)
+        yield lambda share: shown.update(task, completed=share)
+    for status in _moving:
+        status.start()
 
 
 @contextlib.contextmanager

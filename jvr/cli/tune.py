@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from jvr.cli.beforehand import Beforehand
 from jvr.cli.inputs import BadInput, reading
 from jvr.cli.runtime import progress, provenance, use_compilation_cache
 from jvr.io.config import Config, build_cameras, build_scene
@@ -25,10 +26,12 @@ def tune_settings(config: Config, output: Path, error: float | None, seconds: fl
     """
     use_compilation_cache()
     began = time.perf_counter()
+    beforehand = Beforehand()
     with reading():
         scene = build_scene(config)
         camera = build_cameras(config, scene.volume)[0]
         with_settings(config.text, Settings())
+        scene = beforehand(scene)
     with progress("measuring"), reading():
         found = tune(scene, camera, error=error, seconds=seconds)
     if not found.met:
@@ -50,6 +53,7 @@ def tune_settings(config: Config, output: Path, error: float | None, seconds: fl
         "predicted": _numbers(found.predicted),
         "measured": _numbers(found.measured),
         "candidates": [{**_named(m.settings), **_numbers(m)} for m in found.candidates],
+        "precomputed": beforehand.report,
         "seconds": time.perf_counter() - began,
         **provenance(),
     }

@@ -80,7 +80,7 @@ def _fits(config: Config, *parts: str) -> bool:
 
 def _environment(config: Config, key: str, table: AnyEnvironment) -> EnvironmentLight:
     keywords = table.given()
-    rotation, clamped = keywords.pop("rotation"), keywords.pop("clamped", True)
+    rotation, clamped, scale = keywords.pop("rotation"), keywords.pop("clamped", True), keywords.pop("scale", 1.0)
     with blame(config.where(key), key):
         if isinstance(table, ImageTable):
             keywords.pop("source", None)
@@ -89,7 +89,7 @@ def _environment(config: Config, key: str, table: AnyEnvironment) -> Environment
                 light = EnvironmentLight.from_image(found, **keywords)
         else:
             light = (EnvironmentLight.constant if table.kind == "constant" else EnvironmentLight.disc)(**keywords)
-        light = EnvironmentLight(light.coefficients, clamped=clamped)
+        light = EnvironmentLight(scale * light.coefficients, clamped=clamped)
         return light.rotated(_rotation(rotation)) if rotation else light
 
 

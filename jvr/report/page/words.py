@@ -53,6 +53,8 @@ def worst_in_words(worst: Sequence[tuple[str, float]], transfer: AbstractTransfe
     """The worst-determined combination as a sentence: what one can raise and lower together without changing the pictures."""
     raised = _unknowns_in_words([name for name, coefficient in worst if coefficient > 0], transfer)
     lowered = _unknowns_in_words([name for name, coefficient in worst if coefficient < 0], transfer)
+    if not lowered and not raised:
+        return "No unknown changes the pictures."
     if not lowered or not raised:
         return f"Changing {_listed(raised or lowered)} together hardly changes the pictures."
     return f"Raising {_listed(raised)} while lowering {_listed(lowered)} hardly changes the pictures."

@@ -50,6 +50,7 @@ class ImageTable(AroundTable):
     kind: Literal["image"]
     path: str
     source: str | None = None
+    scale: Annotated[float, number("factor between the map's radiance and the scene's", 0.0)] = 1.0
     order: Order | None = None
     window: Annotated[float, number("band from which nothing is left", 0.0, inner=True)] | None = None
 
