@@ -97,7 +97,7 @@ def memory() -> dict[str, Any]:
 def fitting() -> dict[str, Any]:
     """The CT head protocol (docs/fitting.md): time to 60 dB in evaluations of a plain forward march over the same kept samples."""
     from experiments.protocols import ct_head
-    from jvr.fitting.observations import keep_samples, observe, observed_medium
+    from jvr.fitting.observations import keep_samples, observe, observed_medium, seen_in_fit
 
     protocol = ct_head()
     if protocol is None:
@@ -107,7 +107,7 @@ def fitting() -> dict[str, Any]:
     observations = observe(start, cameras, images, None, settings, chunk)
     kept = keep_samples(start, observations, settings, chunk, 2**31)
     assert kept is not None
-    through, rays = observed_medium(start, kept[1], kept[0], settings)
+    through, rays = observed_medium(start, kept[1], kept[0], settings, seen_in_fit(start, settings))
     plain = jax.jit(yardsticks.kept_march)
     dt = step_length(start, settings)
     jax.block_until_ready(plain(through, rays, dt))

@@ -16,6 +16,7 @@ A row is the worst of its cases. "Finite" is said of value, reverse mode, forwar
 """
 
 import argparse
+import dataclasses
 import json
 import math
 import sys
@@ -188,7 +189,47 @@ def rows(quick: bool = False) -> dict[str, list[Case]]:
             cases = [base(sigma=f, shadows=shadows, label=f"depth {f:g}") for f in (0.0, 1.0, 1e4, 1e8)]
             cases += [base(**unit, lights=point(*p), shadows=shadows, label=str(p)) for p in ((2, 2.5, 3), (2.2, 2.7, 3.4))]
             found[f"{type(shadows).__name__}: optical depth 0 ... 1e8, light inside"] = cases
-    return found
+    return found | natural_rows(quick)
+
+
+def natural(
+    *, order: int = 3, transfer: Any = None, material: Any = None, light: Any = None, label: str = "", **parts: Any
+) -> Case:
+    """The same volume under light from all around: a dim sky and, unless told, a lamp ten thousand times as bright."""
+    case = base(shadows=None, lights=(), label=label, **parts)
+    if light is None:
+        light = jvr.EnvironmentLight.disc([0.3, 0.5, 0.8], 2.0, 1e4, order) + jvr.EnvironmentLight.constant(1.0)
+    scene = dataclasses.replace(
+        case.scene,
+        shading=None,
+        scattering=None,
+        environment=light,
+        material=material or jvr.MicrofacetBRDF(roughness=0.4),
+        radiance_transfer=transfer or jvr.RadianceTransfer(order, 8, 1.0),
+    )
+    return case._replace(scene=scene)
+
+
+def natural_rows(quick: bool) -> dict[str, list[Case]]:
+    """Hard cases of light from all around."""
+    depths = (1.0, 1e8) if quick else (0.0, 1e-6, 1.0, 1e2, 1e4, 1e8)
+    rough = (0.05, 1.0) if quick else (0.01, 0.05, 0.2, 1.0)
+    exact = lambda **settings: jvr.RadianceTransfer(3, 8, 1.0, exact=True, **settings)
+    bleeds = jvr.RadianceTransfer(3, 8, 1.0, bleeding=jvr.MaterialBleeding())
+    return {
+        "transfer: optical depth 0 ... 1e8, shortcut": [natural(sigma=f, label=f"{f:g}") for f in depths],
+        "transfer: optical depth 0 ... 1e8, exact": [natural(sigma=f, transfer=exact(), label=f"{f:g}") for f in depths],
+        "transfer: material bleeding, order 0 and 3": [
+            natural(transfer=bleeds, label="3"),
+            natural(order=0, transfer=jvr.RadianceTransfer(0, 8, 1.0), label="0"),
+        ],
+        "transfer: no gradient, all gradient": [
+            natural(values=np.full(SHAPE, 0.5), label="constant"),
+            natural(transfer=exact(surface=1e-6), label="alpha 0"),
+            natural(transfer=exact(surface=1e6), label="alpha 90 degrees"),
+        ],
+        "microfacets: roughness 0.01 ... 1": [natural(material=jvr.MicrofacetBRDF(roughness=r), label=f"{r:g}") for r in rough],
+    }
 
 
 def _loss(inputs: Any, rest: Any, settings: jvr.Settings):

@@ -121,7 +121,7 @@ def test_a_measured_material_is_read_from_a_file(tmp_path):
         ("{frozen=false}", jvr.RadianceTransfer()),
         (
             "{order=2,rays=8,resolution=1,bleeding='transfer',chromaticity=1,neighbourhood=0.2,exact=true,step=2,growth=1,"
-            "start=0,termination=0,surface=0.5,memory=1e6}",
+            "termination=0,surface=0.5,memory=1e6}",
             jvr.RadianceTransfer(
                 2,
                 8,
@@ -132,7 +132,6 @@ def test_a_measured_material_is_read_from_a_file(tmp_path):
                 exact=True,
                 step=2,
                 growth=1,
-                start=0,
                 termination=0,
                 surface=0.5,
                 memory=1e6,

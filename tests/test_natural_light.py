@@ -184,7 +184,7 @@ def test_above_an_opaque_half_space_is_a_hemisphere():
         opaque,
         environment=light(),
         material=jvr.LambertBRDF(),
-        radiance_transfer=jvr.RadianceTransfer(rays=1024, resolution=0.1, start=0.0),
+        radiance_transfer=jvr.RadianceTransfer(rays=1024, resolution=0.1),
     )
     projection = TransferProjection.of(half_space, absorbing(half_space, None, False))
     c, opened = compiled(lambda q, p: q.project(p))(projection, jnp.array([[20.0, 20.0, 10.2], [20.0, 20.0, 9.9]]))
@@ -199,7 +199,7 @@ def test_above_an_opaque_half_space_is_a_hemisphere():
 
 def test_transfer_is_a_plain_sum_over_rays():
     """A loop over directions and steps, by the equations, in NumPy."""
-    transfer = jvr.RadianceTransfer(order=2, rays=7, resolution=1.0, start=0.0, growth=1.3, termination=0.0)
+    transfer = jvr.RadianceTransfer(order=2, rays=7, resolution=1.0, growth=1.3, termination=0.0)
     lit = scene(transfer=transfer)
     c, opened = transfer_at(lit)
     assert np.all(np.asarray(opened) >= 0.5)

@@ -10,6 +10,7 @@ symmetric about the normal or the eye alone needs one direction, that one.
 """
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -55,13 +56,18 @@ class PlaneTable(eqx.Module):
     def at(self, place: tuple[Array, Scalar], theta: Scalar) -> Float[Array, "bands directions channels"]:
         """Weights for a class and a fraction towards the next, and a polar angle of the eye."""
         classes, polar, _ = self.rows.shape
-        x = jnp.clip(theta / (math.pi / 2) * (polar - 1), 0, max(polar - 1, 0))
-        low = jnp.clip(jnp.floor(x), 0, max(polar - 2, 0)).astype(jnp.int32)
-        flat = self.rows.reshape(classes * polar, -1)
-        along = [(0, 1 - (x - low)), (1, x - low)] if polar > 1 else [(0, jnp.ones_like(x))]
-        kinds = [(0, 1 - place[1]), (1, place[1])] if classes > 1 else [(0, jnp.ones_like(x))]
-        row = sum((v * w) * flat[(place[0] + j) * polar + low + i] for i, v in along for j, w in kinds)
+        # What has one entry is not looked up: the compiler could not know that there is nothing to choose.
+        kinds = _between(place[0], place[1]) if classes > 1 else [(0, 1.0)]
+        x = jnp.clip(theta / (math.pi / 2) * (polar - 1), 0, polar - 1)
+        low = jnp.clip(jnp.floor(x), 0, max(polar - 2, 0))
+        angles = _between(low.astype(jnp.int32), x - low) if polar > 1 else [(0, 1.0)]
+        row = sum(v * w * self.rows[i, j] for i, v in kinds for j, w in angles)
         return jnp.asarray(row).reshape(self.shape)
+
+
+def _between(low: Array, share: Scalar) -> list[tuple[Any, Any]]:
+    """An entry and the next, with their weights."""
+    return [(low, 1 - share), (low + 1, share)]
 
 
 class NaturalLight(eqx.Module):

@@ -98,8 +98,6 @@ class RadianceTransfer(AbstractRadianceTransfer):
     - `chromaticity`: `None`, or the order to keep colour differences at, where rays carry colour; luminance keeps `order`.
     - `step`, `growth`: first step in voxels, and the ratio of a step to the one before; `termination`: a ray ends once its transmittance
       is at most this.
-    - `start`: length in voxels that rays leave out at their beginning, so that nodes below a surface do not darken the samples on it;
-      what is thinner casts no shadow.
     - `surface`: see above.
     - `memory`: bytes that the coefficients may take.
 
@@ -118,7 +116,6 @@ class RadianceTransfer(AbstractRadianceTransfer):
     chromaticity: int | None = eqx.field(static=True)
     step: float = eqx.field(static=True)
     growth: float = eqx.field(static=True)
-    start: float = eqx.field(static=True)
     termination: float = eqx.field(static=True)
     surface: float = eqx.field(static=True)
     memory: float = eqx.field(static=True)
@@ -137,7 +134,6 @@ class RadianceTransfer(AbstractRadianceTransfer):
         chromaticity: int | None = None,
         step: float | int = 1.0,
         growth: float | int = 1.1,
-        start: float | int = 3.0,
         termination: float | int = 0.05,
         surface: float | int = 0.1,
         memory: float | int = 2e9,
@@ -148,7 +144,6 @@ class RadianceTransfer(AbstractRadianceTransfer):
             "resolution must be above 0 and at most 1 nodes for each voxel": not 0 < resolution <= 1,
             "neighbourhood must be above 0 and at most 1 of the longest side": not 0 < neighbourhood <= 1,
             "step must be above 0 and growth at least 1": not (step > 0 and growth >= 1),
-            "start must not be negative": not start >= 0,
             "termination must be a transmittance in [0, 1)": not 0 <= termination < 1,
             "surface must be a positive change of transparency": not surface > 0,
             "chromaticity must be None or an order up to that of the luminance, and needs bleeding": chromaticity is not None
@@ -159,7 +154,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
                 raise ValueError(f"{message}; see the docstring of RadianceTransfer for what the defaults are")
         self.order, self.rays, self.exact, self.chromaticity = order, rays, bool(exact), chromaticity
         self.resolution, self.neighbourhood, self.memory = float(resolution), float(neighbourhood), float(memory)
-        self.step, self.growth, self.start = float(step), float(growth), float(start)
+        self.step, self.growth = float(step), float(growth)
         self.termination, self.surface = float(termination), float(surface)
         self.bleeding, self.scattering, self.projected = bleeding, scattering, None
 
@@ -196,6 +191,10 @@ class RadianceTransfer(AbstractRadianceTransfer):
     def is_frozen(self) -> bool:
         return self.projected is not None
 
+    @property
+    def is_final(self) -> bool:
+        return self.projected is not None and (self.scattering is None or self.projected.scattered)
+
     def shape(self, volume: Volume) -> tuple[int, int, int]:
         """Nodes along each axis. **Raises** `ValueError` where their coefficients would exceed `memory`."""
         x, y, z = (1 if n == 1 else max(2, math.ceil((n - 1) * self.resolution) + 1) for n in volume.shape)
@@ -215,9 +214,9 @@ class RadianceTransfer(AbstractRadianceTransfer):
         return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(parts)])
 
     def boundaries(self, shape: tuple[int, int, int]) -> np.ndarray:
-        """Ends of the steps of a ray, as shares of the volume's diameter; the first is where it begins."""
+        """Ends of the steps of a ray, as shares of the volume's diameter."""
         across = max(math.sqrt(sum((n - 1) ** 2 for n in shape)), 1.0)
-        ends = [self.start]
+        ends = [0.0]
         while ends[-1] < across:
             ends.append(ends[-1] + self.step * self.growth ** (len(ends) - 1))
         return np.minimum(np.array(ends), across) / across

@@ -78,6 +78,13 @@ def transfer_of(scene: Scene) -> RadianceTransfer:
     return scene.radiance_transfer
 
 
+def projected_of(scene: Scene) -> ProjectedTransfer:
+    """The radiance transfer of a scene that it has been computed for."""
+    projected = transfer_of(scene).projected
+    assert projected is not None
+    return projected
+
+
 class TransferProjection(eqx.Module):
     """All that the nodes of a scene are projected with. `albedo`: what a material reflects of light of one from everywhere, where rays
     pick that up."""

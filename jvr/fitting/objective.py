@@ -15,13 +15,14 @@ from jaxtyping import Array, Float, Int
 from jvr.fitting.losses import AbstractPrior, SquaredError
 from jvr.fitting.observations import Observations, Samples, observed_medium, seen_in_fit
 from jvr.fitting.unknowns import Exposed, Unknowns
-from jvr.march.differentiation import AbstractAdjoint, Forward, Replay
-from jvr.march.march import Marched, MarchOptions
+from jvr.march.differentiation import AbstractAdjoint, Forward, Replay, Rows
+from jvr.march.march import Marched, MarchOptions, Medium
 from jvr.march.rows import TableRows, table_rows
+from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
-from jvr.rendering.image import composite, step_length, trace
+from jvr.rendering.image import Seen, composite, step_length, trace
 from jvr.rendering.medium import needs_gradient
 from jvr.rendering.settings import Settings
 from jvr.types import Scalar, Triple
@@ -80,18 +81,19 @@ def predict(problem: Problem, model: Exposed, gathered: Marched, length: Float[A
 def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Scalar:
     """Mean loss over all pixels plus priors, as a function of the unknowns on the real line. `pieces` has a leading axis of chunks."""
     model = problem.unknowns.model_from_real(problem.model, real)
+    seen = seen_in_fit(model.scene, problem.settings)
 
     def add_piece(sum_: Scalar, piece: Observations) -> tuple[Scalar, None]:
-        r = residual(problem, model, piece)
+        r = residual(problem, model, piece, seen)
         return sum_ + sum(jnp.sum(piece.weight * problem.loss.value(c)) for c in r), None
 
     loss, _ = jax.lax.scan(add_piece, jnp.zeros((), real.dtype), pieces)
     return loss / total + prior(problem, model)
 
 
-def residual(problem: Problem, model: Exposed, piece: Observations, adjoint: AbstractAdjoint = Replay()) -> Triple:
+def residual(problem: Problem, model: Exposed, piece: Observations, seen: Seen, adjoint: AbstractAdjoint = Replay()) -> Triple:
     """Rendered minus target in each channel, differentiable in the mode of `adjoint`."""
-    medium, rays = observed_medium(model.scene, piece, problem.samples, problem.settings)
+    medium, rays = observed_medium(model.scene, piece, problem.samples, problem.settings, seen)
     options = MarchOptions(problem.settings.termination, distance=False)
     gathered = adjoint.march(options, medium, rays, step_length(model.scene, problem.settings))
     colours = predict(problem, model, gathered, rays.length)
@@ -105,9 +107,8 @@ def image_value(
     """`value` for a loss over whole images: the mean over images plus priors."""
     model = problem.unknowns.model_from_real(problem.model, real)
     settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
-    losses = []
+    losses, where = [], seen_in_fit(model.scene, settings)
     for camera, target in zip(cameras, images, strict=True):
-        where = seen_in_fit(model.scene, settings)
         pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
         gathered, rays, _ = trace(model.scene, camera, settings, pixels, where=where)
         rendered = jnp.stack(predict(problem, model, gathered, rays.length), axis=-1).reshape(target.shape)
@@ -131,20 +132,52 @@ def prior_expansion(problem: Problem, values: Float[Array, "unknowns"]) -> tuple
     return of_values(values), jax.grad(of_values)(values), jax.hessian(of_values)(values)
 
 
-def normal_equations(problem: Problem, values: Float[Array, "unknowns"], piece: Observations) -> Normal:
-    """The sums of `Normal` over one chunk of rays, in float64.
+class Prepared(NamedTuple):
+    """How much light reaches each point, where that takes long and is therefore made once for all chunks: its floating-point arrays, the
+    others, and the derivatives of the first in each of the `directions` of `_Kinds` (a leading axis)."""
+
+    arrays: Any
+    rest: Any
+    tangents: Any
+
+
+def prepared(problem: Problem, values: Float[Array, "unknowns"]) -> Prepared | None:
+    """What `normal_equations` of all chunks need at one point, or `None` where that is nothing worth keeping."""
+    transfer = problem.model.scene.radiance_transfer
+    return None if transfer is None or transfer.is_final else _prepared(problem, values)
+
+
+@eqx.filter_jit
+def _prepared(problem: Problem, values: Float[Array, "unknowns"]) -> Prepared:
+    kinds = _Kinds.of(problem)
+
+    def around(part: Array) -> tuple[Any, Any]:
+        return eqx.partition(seen_in_fit(kinds.changed(part, values).scene, problem.settings).shadows, eqx.is_inexact_array)
+
+    part = values[kinds.inner]
+    if not part.size:
+        return Prepared(*around(part), None)
+    along = jax.vmap(lambda direction: jax.jvp(around, (part,), (direction,), has_aux=True), out_axes=(None, 0, None))
+    arrays, tangents, rest = along(kinds.basis(values.dtype))
+    return Prepared(arrays, rest, tangents)
+
+
+def normal_equations(
+    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: Prepared | None = None
+) -> Normal:
+    """The sums of `Normal` over one chunk of rays, in float64; `around`: what `prepared` returns, else made for this chunk alone.
 
     The rows have the precision of `values`, their products are summed in float64. A matrix summed in float32 is uncertain by 1e-7, and
     already an eigenvalue of 1e-7 is a combination of unknowns that changes the images by 3e-4 of what a single one does.
     """
-    channels = _channels(problem, values, piece)
+    channels = _channels(problem, values, piece, around)
     with jax.enable_x64(True):
         return _sums(channels, values.size)
 
 
 @eqx.filter_jit
-def _channels(problem: Problem, values: Float[Array, "unknowns"], piece: Observations) -> list[_Channel]:
-    colours, blocks = _jacobian(problem, values, piece)
+def _channels(problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: Prepared | None) -> list[_Channel]:
+    colours, blocks = _jacobian(problem, values, piece, around)
     channels = []
     for c, colour in enumerate(colours):
         r = colour - piece.target[:, c]
@@ -170,69 +203,116 @@ def _sums(channels: list[_Channel], n: int) -> Normal:
     return total
 
 
-def _jacobian(problem: Problem, values: Float[Array, "unknowns"], piece: Observations) -> tuple[Triple, list[Blocks]]:
+def _jacobian(
+    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: Prepared | None
+) -> tuple[Triple, list[Blocks]]:
     """Predicted colours of a chunk, and for each channel blocks of its Jacobian with the unknowns that they belong to."""
-    unknowns = problem.unknowns
-    model = unknowns.insert(problem.model, unknowns.split(values, problem.model))
-    entries, outer, inner = _kinds(problem)
-    medium, rays = observed_medium(model.scene, piece, problem.samples, problem.settings)
+    kinds = _Kinds.of(problem)
+    model = kinds.changed(values[kinds.inner], values)
     options = MarchOptions(problem.settings.termination, distance=False)
-    dt = step_length(model.scene, problem.settings)
     blocks: list[Blocks] = [[], [], []]
-    if entries:
-        gathered, rows = table_rows(options, medium, rays, dt)
-        _add_entries(problem, model, gathered, rows, rays.length, entries, blocks)
-    else:
-        gathered = Forward().march(options, medium, rays, dt)
-    replace = lambda columns, part: unknowns.insert(problem.model, unknowns.split(values.at[columns].set(part), problem.model))
-    if outer:
-        columns = np.concatenate([columns for columns in outer.values()])
-        of_outer = jax.jacfwd(lambda part: predict(problem, replace(columns, part), gathered, rays.length))(values[columns])
-        for c in range(3):
-            blocks[c].append((of_outer[c], columns))
-    if inner:
-        columns = np.concatenate([columns for columns in inner.values()])
+    arrays, rest, tangents = around or Prepared(None, None, None)
 
-        def of_inner(part: Array) -> Triple:
-            changed = replace(columns, part)
-            medium, rays = observed_medium(changed.scene, piece, problem.samples, problem.settings)
-            gathered = Forward().march(options, medium, rays, step_length(changed.scene, problem.settings))
-            return predict(problem, changed, gathered, rays.length)
+    def observed(scene: Scene, arrays: Any) -> tuple[Medium, Rays]:
+        visible = None if around is None else eqx.combine(arrays, rest)
+        seen = seen_in_fit(scene, problem.settings, visible)
+        return observed_medium(scene, piece, problem.samples, problem.settings, seen)
 
-        jacobian = jax.jacfwd(of_inner)(values[columns])
+    def of_inner(part: Array, arrays: Any) -> tuple[Triple, Marched]:
+        changed = kinds.changed(part, values)
+        medium, rays = observed(changed.scene, arrays)
+        gathered = Forward().march(options, medium, rays, step_length(changed.scene, problem.settings))
+        return predict(problem, changed, gathered, rays.length), gathered
+
+    medium, rays = observed(model.scene, arrays)
+    gathered = None
+    if kinds.inner.size:
+        point = (values[kinds.inner], arrays)
+        along = jax.vmap(lambda *t: jax.jvp(of_inner, point, t, has_aux=True), out_axes=(None, 0, None))
+        _, jacobian, gathered = along(kinds.basis(values.dtype), tangents)
         for c in range(3):
-            blocks[c].append((jacobian[c], columns))
+            blocks[c].append((jacobian[c].T, kinds.inner[kinds.directions[:, c]]))
+    if kinds.entries:
+        gathered, rows = table_rows(options, medium, rays, step_length(model.scene, problem.settings))
+        _add_entries(problem, model, gathered, rows, rays.length, kinds.entries, blocks)
+    elif gathered is None:
+        gathered = Forward().march(options, medium, rays, step_length(model.scene, problem.settings))
+    if kinds.outer.size:
+        after = lambda part: predict(problem, kinds.changed(part, values, kinds.outer), gathered, rays.length)
+        of_outer = jax.jacfwd(after)(values[kinds.outer])
+        for c in range(3):
+            blocks[c].append((of_outer[c], kinds.outer))
     return predict(problem, model, gathered, rays.length), blocks
 
 
 def march_unknowns(problem: Problem) -> int:
-    """How many unknowns act inside the march without being entries of a table."""
-    return sum(columns.size for columns in _kinds(problem)[2].values())
+    """How many derivatives are taken by forward mode, at the cost of a march each."""
+    return len(_Kinds.of(problem).directions)
 
 
-def _kinds(problem: Problem) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Columns of the unknowns that are entries of a table (rows), act after the march (outer), or act inside it (inner)."""
-    entries: dict[str, np.ndarray] = {}
-    outer: dict[str, np.ndarray] = {}
-    inner: dict[str, np.ndarray] = {}
-    begin = 0
-    for name, array in zip(problem.unknowns.names, problem.unknowns.values(problem.model), strict=True):
-        columns = np.arange(begin, begin + array.size).reshape(array.shape)
-        begin += array.size
-        is_table = has_rows(problem.model.scene)
-        if is_table and name in ("scene.transfer.rgb", "scene.transfer.sigma_t"):
-            entries[name] = columns
-        elif name in ("scene.background", "exposure"):
-            outer[name] = columns.ravel()
-        else:
-            inner[name] = columns.ravel()
-    return entries, outer, inner
+def adjoint_of(problem: Problem) -> AbstractAdjoint:
+    """How the whole residual vector is differentiated."""
+    moves_light = any(name.startswith("scene.environment") for name in problem.unknowns.names)
+    known = problem.model.scene.radiance_transfer is None or not moves_light
+    return Rows() if known and has_rows(problem.model.scene) else Forward()
+
+
+class _Kinds(NamedTuple):
+    """Places of the unknowns in the vector of all by how they act: as `entries` of a table (rows), after the march (`outer`), or inside
+    it (`inner`). `directions`: places in `inner` that are moved together, one for each channel of the picture."""
+
+    problem: Problem
+    entries: dict[str, np.ndarray]
+    outer: np.ndarray
+    inner: np.ndarray
+    directions: np.ndarray
+
+    @classmethod
+    def of(cls, problem: Problem) -> "_Kinds":
+        entries: dict[str, np.ndarray] = {}
+        outer, inner, directions = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros((0, 3), int)]
+        begin, taken = 0, 0
+        with_rows = has_rows(problem.model.scene)
+        for name, array in zip(problem.unknowns.names, problem.unknowns.values(problem.model), strict=True):
+            places = np.arange(begin, begin + array.size)
+            begin += array.size
+            if with_rows and name in ("scene.transfer.rgb", "scene.transfer.sigma_t"):
+                entries[name] = places.reshape(array.shape)
+            elif name in ("scene.background", "exposure"):
+                outer.append(places)
+            else:
+                inner.append(places)
+                own = taken + np.arange(array.size)
+                taken += array.size
+                # A colour of light from all around is seen in that colour alone: one march for all three.
+                apart = name == "scene.environment.coefficients"
+                directions.append(own.reshape(-1, 3) if apart else np.repeat(own[:, None], 3, axis=1))
+        return cls(problem, entries, np.concatenate(outer), np.concatenate(inner), np.concatenate(directions))
+
+    def basis(self, dtype: Any) -> Float[Array, "directions inner"]:
+        """`directions` as vectors."""
+        vectors = np.zeros((len(self.directions), self.inner.size))
+        np.put_along_axis(vectors, self.directions, 1.0, axis=1)
+        return jnp.asarray(vectors, dtype)
+
+    def changed(self, part: Array, values: Float[Array, "unknowns"], places: np.ndarray | None = None) -> Exposed:
+        """The model of `values` with `part` in some places, by default those of `inner`. Arrays that hold none of them do not depend on
+        `part`."""
+        unknowns, model = self.problem.unknowns, self.problem.model
+        where = {int(k): i for i, k in enumerate(self.inner if places is None else places)}
+        arrays, begin = [], 0
+        for array in unknowns.split(values, model):
+            first = where.get(begin)
+            begin += array.size
+            arrays.append(array if first is None else part[first : first + array.size].reshape(array.shape))
+        return unknowns.insert(model, arrays)
 
 
 def has_rows(scene: Scene) -> bool:
     """Whether entries of the transfer function act through what a sample is classified as, and nothing else."""
     by_gradient = needs_gradient(scene) and scene.normals.of_opacity
-    return isinstance(scene.transfer, AbstractTable) and scene.shadows is None and not by_gradient
+    shade = scene.shadows is not None or (scene.radiance_transfer is not None and not scene.radiance_transfer.is_frozen)
+    return isinstance(scene.transfer, AbstractTable) and not shade and not by_gradient
 
 
 def _add_entries(

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jvr.march.fields import KeptField, VoxelField
-from jvr.march.march import Medium
+from jvr.march.march import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
 from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.model.camera import AbstractCamera
@@ -148,16 +148,19 @@ def keep_samples(
     return Samples(jnp.asarray(stored), low, scale, chunk), kept
 
 
-def seen_in_fit(scene: Scene, settings: Settings) -> Seen:
-    """What is computed once for all rays. Without a bound on what is negligible, derivatives would not leap over anything."""
+def seen_in_fit(scene: Scene, settings: Settings, visible: AbstractVisibility | None = None) -> Seen:
+    """What is computed once for all rays; `visible`: how much light reaches a point, where that is known. Without a bound on what is
+    negligible, derivatives would not leap over anything."""
     where = occupancy(scene, settings) if settings.negligible else None
-    return Seen(where, visibility(scene, where), natural(scene))
+    return Seen(where, visibility(scene, where) if visible is None else visible, natural(scene))
 
 
-def observed_medium(scene: Scene, piece: Observations, samples: Samples | None, settings: Settings) -> tuple[Medium, Rays]:
+def observed_medium(
+    scene: Scene, piece: Observations, samples: Samples | None, settings: Settings, seen: Seen
+) -> tuple[Medium, Rays]:
     """What the rays of a piece march through, resampled anew or from kept samples, and the rays inside of it."""
     rays, _ = enter(scene, piece.origin, piece.direction)
-    through = medium(scene, settings, *seen_in_fit(scene, settings))
+    through = medium(scene, settings, *seen)
     if samples is not None:
         through = through._replace(field=KeptField(samples.stored, piece.start, samples.low, samples.scale, samples.stride))
     return through, rays

@@ -177,10 +177,10 @@ def choose_unknowns(model: Exposed, select: Callable[[Exposed], Any], transforms
 
     `select` is called on abstract arrays: it may look at structure and shapes, not at values.
 
-    Without `transforms` (a tuple, one for each array, `None` where the default is wanted), colours, albedo and weights get `Sigmoid()`,
-    asymmetries `Sigmoid(-1, 1)`, extinction, heights, widths and what lights and surfaces have of strength `Softplus`, positions of
-    a table `Ordered`, directions `Direction`, shares of a material `Sigmoid`, coefficients of a dipole `Softplus`, anything else
-    `Identity`.
+    Without `transforms` (a tuple, one for each array, `None` where the default is wanted), colours, albedo, weights and shares of light
+    that a material reflects get `Sigmoid()`, asymmetries `Sigmoid(-1, 1)`, roughness and indices of refraction `Sigmoid` between their
+    bounds, extinction, heights, widths, coefficients of dipoles and what lights and surfaces have of strength `Softplus`, positions
+    of a table `Ordered`, directions `Direction`, anything else (such as the coefficients of an environment) `Identity`.
 
     **Raises** `ValueError` where an array is not one of the scene's, not floating point or named twice, or the number of transforms
     differs.
@@ -233,31 +233,23 @@ def _name(path: Any) -> str:
 
 def _default_transform(name: str, value: Array, model: Exposed) -> AbstractTransform:
     field = name.rsplit(".", 1)[-1]
-    if field in ("rgb", "background"):
+    of_material = name.startswith("scene.material")
+    if field in ("rgb", "background") or (of_material and field in ("diffuse", "specular")):
         return Sigmoid()
     if field in ("sigma_t", "height"):
         return Softplus(1.0 / jnp.min(model.scene.volume.spacing))
-    if name.startswith("scene.material") and field in (
-        "reflectance",
-        "base",
-        "metallic",
-        "reflectance_at_normal",
-        "diffuse",
-        "specular",
-    ):
-        return Sigmoid()
-    if field == "roughness":
-        return Sigmoid(1e-3, 1.0)
-    if field in ("exposure", "ambient", "diffuse", "specular", "threshold", "sigma_s_prime", "sigma_a"):
+    if field in ("exposure", "ambient", "diffuse", "specular", "threshold"):
         return Softplus()
-    if field == "eta":
-        return Sigmoid(1.0, 3.0)
-    if field in ("irradiance", "intensity", "radiance", "shininess", "exponent"):
+    if field in ("irradiance", "intensity", "radiance", "shininess", "exponent", "sigma_a", "sigma_s_prime"):
         return Softplus(jnp.maximum(jnp.mean(value), 1e-3))
     if field in ("g", "g1", "g2", "k"):
         return Sigmoid(-1.0, 1.0)
-    if field in ("albedo", "weight"):
+    if field in ("albedo", "weight", "reflectance", "base", "metallic", "reflectance_at_normal"):
         return Sigmoid()
+    if field == "roughness":
+        return Sigmoid(1e-3, 1.0)
+    if field == "eta":
+        return Sigmoid(1.0, 3.0)
     if field == "direction":
         return Direction()
     if field == "width":

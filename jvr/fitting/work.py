@@ -13,10 +13,19 @@ from jaxtyping import Array, Float
 
 from jvr.fitting.identifiability import Determination, determination
 from jvr.fitting.losses import DSSIM, SquaredError
-from jvr.fitting.objective import Normal, Problem, has_rows, image_value, normal_equations, prior_expansion, residual, value
-from jvr.fitting.observations import Observations, thin
+from jvr.fitting.objective import (
+    Normal,
+    Problem,
+    adjoint_of,
+    image_value,
+    normal_equations,
+    prepared,
+    prior_expansion,
+    residual,
+    value,
+)
+from jvr.fitting.observations import Observations, seen_in_fit, thin
 from jvr.fitting.solvers import Functions
-from jvr.march.differentiation import Forward, Rows
 from jvr.model.camera import AbstractCamera
 from jvr.parallel import in_threads
 from jvr.types import Scalar
@@ -58,11 +67,11 @@ class ResidualFunction(eqx.Module):
 
     def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
         model = self.problem.unknowns.model_from_real(self.problem.model, real)
-        adjoint = Rows() if has_rows(model.scene) else Forward()
+        adjoint, seen = adjoint_of(self.problem), seen_in_fit(model.scene, self.problem.settings)
 
         def of_piece(piece: Observations) -> Array:
             scale = jnp.sqrt(piece.weight / self.total)
-            return jnp.stack([scale * c for c in residual(self.problem, model, piece, adjoint)])
+            return jnp.stack([scale * c for c in residual(self.problem, model, piece, seen, adjoint)])
 
         return jnp.ravel(jax.lax.map(of_piece, self.pieces)), None
 
@@ -135,7 +144,8 @@ class Work:
 
     def _sum(self, values: Float[Array, "unknowns"], observations: Observations, problem: Problem | None = None) -> Normal:
         """The normal equations of all chunks together, in float64."""
-        of_piece = functools.partial(normal_equations, problem or self.problem, values)
+        problem = problem or self.problem
+        of_piece = functools.partial(normal_equations, problem, values, around=prepared(problem, values))
         parts = in_threads(of_piece, observations.chunks(self.chunk))
         return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
 

@@ -64,9 +64,11 @@ def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[M
     perturbed = jax.tree.map(lambda t, x: not is_zero(t) and eqx.is_inexact_array(x), tangents, primals, is_leaf=is_zero)
     tangents = eqx.filter(tangents, perturbed)
     medium, rays, dt = primals
-    if medium.shadows is not None:
+    if jax.tree.leaves(tangents[0].shadows):
         raise ValueError(
-            "jvr.Rows() does not know shadows: set Settings(adjoint=jvr.Replay()), or jvr.Forward() for forward mode"
+            "jvr.Rows() does not know shadows that change, nor a radiance transfer or its light: set "
+            "Settings(adjoint=jvr.Replay()), or jvr.Forward() for forward mode; for a transfer function alone, jvr.precompute(scene) "
+            "keeps the radiance transfer as it is"
         )
     rest_of_transfer, entries = _split_entries(tangents[0].transfer)
     if options.distance or not jax.tree.leaves(entries):

@@ -8,6 +8,7 @@ import abc
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -299,25 +300,30 @@ def classify_at(medium: Medium, points: Point, proof: Bool[Array, "points"]) -> 
 
 
 def lit(medium: Medium, where: Stretch, samples: tuple[Sample, ...], *, reverse: bool) -> tuple[Sample, ...]:
-    """The samples of a segment with the light that reaches it, where that is asked for.
-
-    Light is looked up where the segment's own emission comes from on average, in front of its middle: in the middle of an opaque one it
-    is dark, though its front is not.
-    """
-    shadows = medium.shadows
-    if shadows is None:
+    """The samples of a segment with the light that reaches it, where that is asked for."""
+    if medium.shadows is None:
         return samples
     shader, middle = medium.shader, points_at(where.rays, where.ray, where.k, where.u)
     classify = lambda sample, point: shader.classify(medium.transfer, shader.prepare(medium.transfer, sample, point)).sigma_t
     sigma_t = [sigma for sample in samples for sigma in jax.vmap(classify)(sample, middle)]
+    light = light_at(medium, where, sigma_t, reverse=reverse)
+    return tuple(sample._replace(light=light) for sample in samples)
+
+
+def light_at(medium: Medium, where: Stretch, sigma_t: Sequence[Array], *, reverse: bool) -> tuple[Channels, ...]:
+    """How much light reaches a segment with these extinctions.
+
+    It is looked up where the segment's own emission comes from on average, in front of its middle: in the middle of an opaque one it
+    is dark, though its front is not.
+    """
+    assert medium.shadows is not None
     dtau = jnp.minimum(sum(sigma_t[1:], sigma_t[0]) / len(sigma_t) * where.extent, DENSEST)
     points = points_at(where.rays, where.ray, where.k, where.u + where.extent * (mean_depth(dtau) - 0.5))
     # Without extinction there is nothing to see; but where nothing is left out it has a derivative, and between the ends of a segment
     # there may be what is at neither.
-    everywhere = medium.occupancy is None or len(samples) > 1
+    everywhere = medium.occupancy is None or len(medium.shader.places) > 1
     wanted = where.inside if everywhere else where.inside & functools.reduce(jnp.logical_or, [sigma != 0 for sigma in sigma_t])
-    light = computed_once(where.inside, shadows.transmittances(points, wanted, reverse=reverse))
-    return tuple(sample._replace(light=light) for sample in samples)
+    return computed_once(where.inside, medium.shadows.transmittances(points, wanted, reverse=reverse))
 
 
 def places(

@@ -6,7 +6,8 @@ Entry `p` has weight `hat_p(s) = max(0, 1 - |coordinate(s) - p|)` in a sample, s
     dL_c / d sigma_p = sum_k hat_p(s_k) (T_k de_k - T_k+1 B_k+1 ddtau_k) / d sigma,
 
 with `T_k` the transmittance in front of segment `k` and `B_k+1` the radiance from behind it (see
-`jvr.march.adjoint`). Channel `c` of the radiance must depend on channel `c` of the colour alone.
+`jvr.march.adjoint`). Channel `c` of the radiance must depend on channel `c` of the colour alone, and how much light reaches a point not on
+the table.
 """
 
 from typing import NamedTuple
@@ -17,10 +18,21 @@ from jaxtyping import Array, Float, Int
 
 from jvr.march.adjoint import BackLanes, Behind, segment_cotangents, step_back
 from jvr.march.batch import pooled_while
-from jvr.march.march import Marched, MarchOptions, Medium, for_derivatives, integrate, lanes_of, shown, transmittance
+from jvr.march.march import (
+    Marched,
+    MarchOptions,
+    Medium,
+    Stretch,
+    for_derivatives,
+    integrate,
+    lanes_of,
+    light_at,
+    shown,
+    transmittance,
+)
 from jvr.march.steps import Rays, points_at, segment
-from jvr.model.transfer import AbstractTable
-from jvr.types import Scalar
+from jvr.model.transfer import AbstractTable, Classified
+from jvr.types import Channels, Scalar
 
 # Segments whose contributions are added to the rows in one pass over memory: the rows are long, the segments short.
 BLOCK = 8
@@ -87,7 +99,14 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, behind: Behind, j:
     samples = jax.vmap(medium.field.resample)(points)
     samples = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, points)
     classified = jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, samples)
-    (emitted, dtau), pull = jax.vjp(lambda c: jax.vmap(medium.shader.segment)(c, samples, points, extent), classified)
+    where = Stretch(lanes.rays, lanes.ray, k, distance, extent, k < count)
+
+    def seen(classified: Classified) -> tuple[Channels, Channels]:
+        # Where in the segment the light is looked up depends on its extinction; the light itself does not.
+        light = {} if medium.shadows is None else {"light": light_at(medium, where, classified.sigma_t, reverse=True)}
+        return jax.vmap(medium.shader.segment)(classified, samples._replace(**light), points, extent)
+
+    (emitted, dtau), pull = jax.vjp(seen, classified)
     front = back.depth(j, behind, dtau)
     before = transmittance(*front)
 

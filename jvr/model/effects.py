@@ -90,6 +90,11 @@ class AbstractRadianceTransfer(eqx.Module):
     def is_frozen(self) -> bool:
         """Whether it has been computed beforehand, so that it does not follow the transfer function."""
 
+    @property
+    @abc.abstractmethod
+    def is_final(self) -> bool:
+        """Whether a picture has nothing left to do but to multiply it with the light."""
+
     @abc.abstractmethod
     def outdated(self, transfer: Any, material: AbstractMaterial | None) -> tuple[str, ...]:
         """What has to be computed again for this transfer function and material, in a sentence; empty where nothing has."""

@@ -195,7 +195,6 @@ class RadianceTransferTable(Table):
     chromaticity: Order | None = None
     step: Annotated[float, number("first step in voxels", 0.0, inner=True)] | None = None
     growth: Annotated[float, number("ratio of a step to the one before", 1.0)] | None = None
-    start: Annotated[float, number("voxels that rays leave out at their beginning", 0.0)] | None = None
     termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", 0.0, 0.999)] | None = None
     surface: Annotated[float, number("change of transparency between nodes", 0.0, inner=True)] | None = None
     memory: Annotated[float, number("bytes", 0.0, inner=True)] | None = None
