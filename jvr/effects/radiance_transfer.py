@@ -21,7 +21,7 @@ from jvr.model.harmonics.basis import basis, count
 from jvr.model.light import perpendicular
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import ClippingBox, Volume
-from jvr.numerics import direction_and_length, ray_box
+from jvr.numerics import direction_and_length, one_minus_exp, ray_box
 from jvr.types import Channels, Triple
 
 Numbers: TypeAlias = Float[Array, "..."]
@@ -274,23 +274,24 @@ def _cone(transfer: RadianceTransfer, volume: Volume, medium: Medium, p: Triple)
     lower, upper = volume.domain
     half = 0.5 / transfer.resolution
 
-    def transparency(p: Triple) -> Numbers:
+    def opacity(p: Triple) -> Numbers:
         p = tuple(jnp.clip(c, low, high) for c, low, high in zip(p, lower, upper, strict=True))
         sigma_t = classify_at(medium, _points(p, p), jnp.ones(p[0].shape, bool))[0].sigma_t
-        return jnp.exp(-width * sum(sigma_t[1:], sigma_t[0]) / len(sigma_t))
+        # Not 1 less the transparency: thin media keep their digits.
+        return one_minus_exp(width * sum(sigma_t[1:], sigma_t[0]) / len(sigma_t))
 
     differences = []
     for axis, n in enumerate(volume.shape):
         ends = [tuple(c + sign * half * (a == axis) for a, c in enumerate(p)) for sign in (-1, 1)]
         span = jnp.clip(ends[1][axis], 0, n - 1) - jnp.clip(ends[0][axis], 0, n - 1)
-        change = transparency(ends[1]) - transparency(ends[0])
+        change = opacity(ends[0]) - opacity(ends[1])
         differences.append(jnp.where(span > 0, change / jnp.where(span > 0, span, 1.0), 0.0))
     inverse = volume.axes_inverse
     gradient = tuple(sum((inverse[j, i] * differences[j] for j in range(3)), jnp.zeros_like(p[0])) for i in range(3))
     axis, length = direction_and_length(gradient)
     flat = length == 0
     axis = (axis[0], axis[1], jnp.where(flat, 1.0, axis[2]))
-    strength = (1 - transparency(p)) * share_of(length * width, jnp.asarray(transfer.surface, length.dtype))
+    strength = opacity(p) * share_of(length * width, jnp.asarray(transfer.surface, length.dtype))
     return Cone(axis, jnp.sin(0.5 * math.pi * (1 - strength)))
 
 
