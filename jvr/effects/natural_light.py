@@ -98,7 +98,9 @@ class NaturalLight(eqx.Module):
         normal = tuple(turn * c for c in normal)
         cosine = dot(normal, w_o)
         across, sine = direction_and_length(tuple(o - cosine * n for o, n in zip(w_o, normal, strict=True)))
-        theta = jnp.where(surface > 0, jnp.arctan2(sine, jnp.where(surface > 0, cosine, 1.0)), 0.0)
+        # Without a normal, or without an eye (a ray that misses), there is no angle, and arctan2 no derivative.
+        there = (surface > 0) & (jnp.abs(cosine) + sine > 0)
+        theta = jnp.where(there, jnp.arctan2(sine, jnp.where(there, cosine, 1.0)), 0.0)
         place = self._class(s)
         parts = []
         for table in (self.tinted, self.plain):

@@ -44,6 +44,11 @@ class TransferVisibility(AbstractVisibility):
         return (*own, self.grid.interpolate(at, wanted))
 
     @property
+    def is_sharp(self) -> bool:
+        # Nodes are further apart than samples.
+        return self.inner is not None
+
+    @property
     def stats(self) -> Any:
         return None if self.inner is None else self.inner.stats
 

@@ -46,6 +46,11 @@ class AbstractField(eqx.Module):
 class AbstractVisibility(eqx.Module):
     """How much of each light reaches a point, and of that from all around where the scene asks for it."""
 
+    @property
+    def is_sharp(self) -> bool:
+        """Whether it may change within a segment, so that it matters where in the segment it is looked up."""
+        return True
+
     @abc.abstractmethod
     def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
         """For each light, the transmittance between it and each of a batch of points, one or three channels, or none where nothing can

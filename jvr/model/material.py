@@ -23,6 +23,9 @@ from jvr.model.effects import AbstractMaterial
 from jvr.model.harmonics.basis import basis
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
+# The largest angle between the normal and the eye that materials are projected for.
+GRAZING = math.pi / 2 - 1e-3
+
 About: TypeAlias = Literal["normal", "eye", "both"]
 
 
@@ -71,7 +74,8 @@ class HarmonicMaterial(AbstractMaterial):
             raise ValueError(f"a material needs at least 2 directions and 4 nodes, not {directions} and {nodes}")
         limit = float_array(threshold, "threshold", ())
         require(limit, lambda t: np.isfinite(t) & (t >= 0), "threshold must be a length of the gradient, not negative")
-        polar = np.array([0.0]) if brdf.about != "both" else np.linspace(0, math.pi / 2, directions)
+        # The last angle is just above the horizon, where in either precision the eye is above the surface.
+        polar = np.array([0.0]) if brdf.about != "both" else np.minimum(np.linspace(0, math.pi / 2, directions), GRAZING)
         w_i, weights = half_sphere_nodes(nodes)
         functions = jnp.stack([row for i, row in enumerate(basis(order, tuple(w_i.T))) if _degree(i) >= 0], axis=1)
 
