@@ -417,6 +417,7 @@ def test_what_is_computed_beforehand_is_said_and_kept(cached, tmp_path, capsys):
     assert "computed beforehand" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_fit_with_a_kept_radiance_transfer_says_what_that_is_worth(cached, capfd):
     assert cli.run(["fit", "natural.toml", "-o", "out"]) == 0
     printed = capfd.readouterr()

@@ -328,6 +328,7 @@ def test_the_config_of_the_documentation_is_valid():
     assert isinstance(made.radiance_transfer.scattering, jvr.Dipole)
 
 
+@pytest.mark.slow
 def test_the_example_of_the_documentation_runs(sky, tmp_path, monkeypatch):
     """With small files in place of the named ones, and a small picture."""
     monkeypatch.chdir(tmp_path)

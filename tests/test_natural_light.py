@@ -384,7 +384,7 @@ GRADIENTS = {
 
 
 # Each takes ten seconds and more to compile.
-SLOW = ("roughness", "transfer function through bleeding", "voxels")
+SLOW = ("roughness", "transfer function through bleeding", "voxels", "lambert, shares", "dipole")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in GRADIENTS])
