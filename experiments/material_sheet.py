@@ -100,7 +100,7 @@ def sheet(probes: dict[str, np.ndarray], found: dict[tuple[str, str], np.ndarray
         row[0].text(-0.04, 0.5, title, transform=row[0].transAxes, rotation=90, va="center", ha="right", fontsize=9)
         for axes, name in zip(row, columns, strict=True):
             axes.imshow(shown(found[title, name]))
-    drawing.savefig(path, dpi=110)
+    drawing.savefig(path, dpi=80)
 
 
 def main() -> None:
