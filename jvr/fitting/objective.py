@@ -226,16 +226,16 @@ def _jacobian(
 
     medium, rays = observed(model.scene, arrays)
     gathered = None
+    if kinds.entries:
+        gathered, rows = table_rows(options, medium, rays, step_length(model.scene, problem.settings))
+        _add_entries(problem, model, gathered, rows, rays.length, kinds.entries, blocks)
     if kinds.inner.size:
         point = (values[kinds.inner], arrays)
         along = jax.vmap(lambda *t: jax.jvp(of_inner, point, t, has_aux=True), out_axes=(None, 0, None))
         _, jacobian, gathered = along(kinds.basis(values.dtype), tangents)
         for c in range(3):
             blocks[c].append((jacobian[c].T, kinds.inner[kinds.directions[:, c]]))
-    if kinds.entries:
-        gathered, rows = table_rows(options, medium, rays, step_length(model.scene, problem.settings))
-        _add_entries(problem, model, gathered, rows, rays.length, kinds.entries, blocks)
-    elif gathered is None:
+    if gathered is None:
         gathered = Forward().march(options, medium, rays, step_length(model.scene, problem.settings))
     if kinds.outer.size:
         after = lambda part: predict(problem, kinds.changed(part, values, kinds.outer), gathered, rays.length)
