@@ -401,6 +401,7 @@ def test_gradients_against_differences_with_the_placement_frozen(x64, optical):
         np.testing.assert_allclose(found, (high - low) / (2 * h), rtol=1e-6, atol=3e-6, err_msg=name)
 
 
+@pytest.mark.slow
 def test_values_and_gradients_at_extremes_are_those_of_double_precision():
     """Invisible, visible, and optical depths of thousands in one segment."""
     weights = np.arange(216.0).reshape(8, 9, 3)

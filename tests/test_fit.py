@@ -75,7 +75,7 @@ def test_levenberg_marquardt_recovers_the_table():
         pytest.param(optx.LBFGS(rtol=1e-8, atol=1e-10), 150, 38, marks=pytest.mark.slow, id="lbfgs"),
         pytest.param(optx.OptaxMinimiser(optax.adam(0.2), rtol=0.0, atol=0.0), 150, 38, marks=pytest.mark.slow, id="adam"),
         pytest.param(optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8), 40, 60, marks=pytest.mark.slow, id="optimistix-lm"),
-        pytest.param(jvr.LBFGSB(upper=1.0), 80, 38, id="lbfgsb"),
+        pytest.param(jvr.LBFGSB(upper=1.0), 80, 38, marks=pytest.mark.slow, id="lbfgsb"),
     ],
 )
 def test_every_solver_gets_near(solver, steps, least):
