@@ -153,6 +153,16 @@ def computed_once(proof: Bool[Array, "..."], x: Tree) -> Tree:
     return jax.lax.cond(jnp.any(proof), lambda x: x, lambda x: jax.tree.map(jnp.zeros_like, x), x)
 
 
+def read_at(array: Shaped[Array, "n"], index: Int[Array, "..."]) -> Shaped[Array, "..."]:
+    """`array[index]` for indices that the caller keeps inside: nothing is wrapped or clamped.
+
+    Numbers of a large array are best read one at a time, even where they lie side by side: the CPU compiler makes one kernel of the reads
+    and what is done with the numbers, with the processor's own gathers; a run is read by a loop into memory.
+    """
+    numbers = jax.lax.GatherDimensionNumbers((), (0,), (0,))
+    return jax.lax.gather(array, index[..., None], numbers, (1,), mode="promise_in_bounds")
+
+
 def read_run(array: Shaped[Array, "n *row"], start: Int[Array, ""], length: int) -> Shaped[Array, "length *row"]:
     """`array[start : start + length]` for a traced `start` that the caller keeps inside: nothing is clamped."""
     numbers = jax.lax.GatherDimensionNumbers(tuple(range(array.ndim)), (), (0,))

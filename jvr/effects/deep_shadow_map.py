@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jvr.effects.light_space import AbstractLightSpace, bilinear, depth_nodes, light_space
 from jvr.effects.shadow_volume import check_size
-from jvr.march.march import AbstractVisibility, Medium
+from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
@@ -52,7 +52,7 @@ class DeepShadowMap(AbstractShadows):
             if space is None:
                 maps.append(None)
                 continue
-            clear = jnp.exp(-depth_nodes(space, scene, medium, self.texels, steps, 1))
+            clear = jnp.exp(-jnp.moveaxis(depth_nodes(space, scene, medium, self.texels, steps, 1), 0, 2))
             maps.append(_deep_map(space, clear, self.layers, self.error))
         return DeepVisibility(scene.volume.world_from_grid, tuple(maps))
 

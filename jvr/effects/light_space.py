@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jvr.march.march import Medium, classify_at
+from jvr.march.medium import Medium
+from jvr.march.segments import classify_at
 from jvr.march.steps import Point
 from jvr.model.light import AbstractLight, DirectionalLight, perpendicular
 from jvr.model.scene import Scene
@@ -24,6 +25,8 @@ from jvr.types import Channels, Scalar, Triple, Vector
 
 # A light nearer to the bounding sphere of the volume than this share of its radius shines in all directions.
 NEAR = 1.01
+# Samples of a sweep that are taken at a time: enough to outweigh what it costs to start an operation and to share it between cores.
+SWEPT = 65536
 
 
 class AbstractLightSpace(eqx.Module):
@@ -140,10 +143,11 @@ def rays_through(space: AbstractLightSpace, scene: Scene, u: Float[Array, "rays"
     return jax.vmap(one)(u, v)
 
 
-def depth_between(medium: Medium, volume: Volume, rays: LightRays, begin: Scalar, end: Scalar) -> Channels:
-    """Optical depth of rays between two depths `w`, by one sample in the middle of what of that is inside of the volume: exact where the
-    medium is homogeneous, and continuous where a border moves."""
-
+def depth_between(
+    medium: Medium, volume: Volume, rays: LightRays, begin: Float[Array, "rays"], end: Float[Array, "rays"]
+) -> Channels:
+    """Optical depth of each ray between two depths `w`, by one sample in the middle of what of that is inside of the volume: exact where
+    the medium is homogeneous, and continuous where a border moves."""
     low, high = (jnp.clip(w * rays.length, rays.enters, rays.leaves) for w in (begin, end))
     middle, inside = 0.5 * (low + high), high > low
     p = (s + middle * d for s, d in zip(rays.start, rays.direction, strict=True))
@@ -156,27 +160,32 @@ def depth_between(medium: Medium, volume: Volume, rays: LightRays, begin: Scalar
 
 def depth_nodes(
     space: AbstractLightSpace, scene: Scene, medium: Medium, texels: int, layers: int, samples: int
-) -> Float[Array, "u v nodes channels"]:
+) -> Float[Array, "nodes u v channels"]:
     """Optical depth from the light to `layers + 1` equally distant depths of `texels^2` rays, by the midpoint rule with `samples` samples a
     layer, swept away from the light."""
     axis = jnp.linspace(-1.0, 1.0, texels)
     u, v = (c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij"))
     rays = rays_through(space, scene, u, v)
+    together = min(max(1, SWEPT // (u.size * samples)), layers)
+    blocks = -(-layers // together)
+    of_all = jax.tree.map(lambda x: jnp.tile(x, together * samples), rays)
 
-    # Checkpointed: the way back computes a layer again rather than keep all of its voxels.
+    # Checkpointed: the way back computes a block of layers again rather than keep all of its voxels.
     @jax.checkpoint
-    def sweep(tau: Channels, layer: Array) -> tuple[Channels, Channels]:
-        for k in range(samples):
-            begin, end = ((layer + (k + half) / samples) / layers for half in (0, 1))
-            dtau = depth_between(medium, scene.volume, rays, begin, end)
-            tau = tuple(t + d for t, d in zip(tau, dtau, strict=True))
-        return tau, tau
+    def sweep(tau: Channels, block: Array) -> tuple[Channels, Channels]:
+        steps = block * together * samples + jnp.arange(together * samples, dtype=axis.dtype)
+        begin, end = (jnp.repeat(steps + half, u.size) / (samples * layers) for half in (0, 1))
+        dtau = depth_between(medium, scene.volume, of_all, begin, end)
+        depths = tuple(
+            t + jnp.cumsum(jnp.sum(d.reshape(together, samples, -1), axis=1), axis=0) for t, d in zip(tau, dtau, strict=True)
+        )
+        return tuple(d[-1] for d in depths), depths
 
-    channels = jax.eval_shape(lambda: depth_between(medium, scene.volume, rays, axis[0], axis[1]))
+    channels = jax.eval_shape(lambda: depth_between(medium, scene.volume, rays, u, v))
     zero = tuple(jnp.zeros(u.shape, c.dtype) for c in channels)
-    _, depths = jax.lax.scan(sweep, zero, jnp.arange(layers, dtype=axis.dtype))
-    rows = jnp.stack([jnp.concatenate([z[None], d]) for z, d in zip(zero, depths, strict=True)], axis=-1)
-    return jnp.moveaxis(rows, 0, 1).reshape(texels, texels, layers + 1, -1)
+    _, depths = jax.lax.scan(sweep, zero, jnp.arange(blocks, dtype=axis.dtype))
+    swept = [jnp.concatenate([z[None], d.reshape(-1, u.size)[:layers]]) for z, d in zip(zero, depths, strict=True)]
+    return jnp.stack(swept, axis=-1).reshape(layers + 1, texels, texels, -1)
 
 
 def bilinear(texels: int, u: Scalar, v: Scalar) -> list[tuple[Array, Scalar]]:

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 
 from jvr.effects.natural_light import NaturalLight
 from jvr.effects.shading import share_of
-from jvr.march.march import Medium, classify_at
+from jvr.march.medium import Medium
+from jvr.march.segments import classify_at
 from jvr.march.steps import Point
 from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer
 from jvr.model.harmonics.basis import basis, count

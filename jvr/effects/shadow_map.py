@@ -7,12 +7,12 @@ from jaxtyping import Array, Bool, Float
 
 from jvr.effects.light_space import AbstractLightSpace, depth_nodes, light_space
 from jvr.effects.shadow_volume import check_size, samples_a_layer
-from jvr.march.march import AbstractVisibility, Medium
+from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
-from jvr.numerics import transformed
+from jvr.numerics import read_at, transformed
 from jvr.types import Affine, Channels, Scalar, Triple
 
 # Layers in which the depth of an occluder is looked for; inside of one it is interpolated.
@@ -57,9 +57,8 @@ class ShadowMap(AbstractShadows):
         # The clearest channel decides: an occluder holds all of them back.
         tau = jnp.min(nodes, axis=-1)
         depth = jnp.log1p(-jnp.asarray(self.threshold, tau.dtype))
-        first = jnp.sum(tau < -depth, axis=-1)
-        before = jnp.take_along_axis(tau, jnp.maximum(first - 1, 0)[..., None], axis=-1)[..., 0]
-        behind = jnp.take_along_axis(tau, jnp.minimum(first, LAYERS)[..., None], axis=-1)[..., 0]
+        first = jnp.sum(tau < -depth, axis=0)
+        before, behind = (jnp.take_along_axis(tau, jnp.clip(k, 0, LAYERS)[None], axis=0)[0] for k in (first - 1, first))
         fraction = jnp.where(behind > before, (-depth - before) / jnp.where(behind > before, behind - before, 1.0), 0.0)
         w = jnp.where(first > LAYERS, jnp.inf, (first - 1 + fraction) / LAYERS)
         _, _, length = space.ray(jnp.zeros_like(spacing), jnp.zeros_like(spacing))
@@ -78,7 +77,7 @@ class DepthMap(eqx.Module):
 
     def lit_share(self, x: Triple, softness: int) -> Scalar:
         """Share of the texels around a world position whose light reaches it."""
-        texels = self.depths.shape[0]
+        texels, depths = self.depths.shape[0], self.depths.reshape(-1)
         u, v, w = self.space.place(x)
         at = [jnp.clip((c + 1) / 2 * (texels - 1), 0, texels - 1) for c in (u, v)]
         low = [jnp.clip(jnp.floor(c), 0, texels - 2) for c in at]
@@ -89,7 +88,7 @@ class DepthMap(eqx.Module):
         for a in range(-softness, softness + 2):
             for b in range(-softness, softness + 2):
                 i, j = (jnp.clip(base.astype(jnp.int32) + k, 0, texels - 1) for base, k in zip(low, (a, b), strict=True))
-                lit = (w < self.depths[i, j]).astype(w.dtype)
+                lit = (w < read_at(depths, i * texels + j)).astype(w.dtype)
                 total += lit * weight(a, fraction[0]) * weight(b, fraction[1])
         return total / (2 * softness + 1) ** 2
 

@@ -8,7 +8,8 @@ from jaxtyping import Array, Bool
 from jvr.effects.shadow_volume import ShadowVolume
 from jvr.march.adjoint import replay_march
 from jvr.march.fields import VoxelField
-from jvr.march.march import AbstractVisibility, Marched, MarchOptions, Medium, march
+from jvr.march.march import Marched, MarchOptions, march
+from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point, Rays
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jvr.effects.cells import AbstractGrid, grid_of
+from jvr.effects.grid import Grid
 from jvr.effects.light_space import AbstractLightSpace, depth_nodes, light_space
-from jvr.march.march import AbstractVisibility, Medium
+from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
@@ -24,7 +24,7 @@ class ShadowVolume(AbstractShadows):
     transmittance is interpolated trilinearly; along the light's rays extinction is sampled every two voxels or less, whatever the
     resolution. Shadows of what is smaller than a node are blurred; the error falls with the square of the resolution in smooth scenes.
 
-    For directional and point (spot) lights. Differentiable in transfer function, voxels, lights and pose. Memory: 32 bytes for each node
+    For directional and point (spot) lights. Differentiable in transfer function, voxels, lights and pose. Memory: 4 bytes for each node
     and channel of extinction.
     """
 
@@ -52,7 +52,7 @@ class OpacityShadowMap(AbstractShadows):
     **Arguments:** `texels`: rays along each axis of the map; `layers`: of optical depth along each. Detail across the light is kept by the
     texels; between two layers transmittance is a straight line.
 
-    For directional and point (spot) lights. Differentiable as `ShadowVolume`. Memory: `32 texels^2 layers` bytes for each channel of
+    For directional and point (spot) lights. Differentiable as `ShadowVolume`. Memory: `4 texels^2 layers` bytes for each channel of
     extinction.
     """
 
@@ -75,13 +75,13 @@ class ClearGrid(eqx.Module):
     """Transmittance between one light and nodes of its coordinates, equally distant in each."""
 
     space: AbstractLightSpace
-    grid: AbstractGrid
+    grid: Grid
 
     def transmittance(self, x: Triple, inside: Bool[Array, "points"]) -> Channels:
         """At a batch of world positions, trilinear. (Not optical depth: behind an opaque surface that is so large that between two nodes
         it would be opaque as well.)"""
         u, v, w = self.space.place(x)
-        at = tuple(c * n for c, n in zip(((u + 1) / 2, (v + 1) / 2, w), self.grid.cells, strict=True))
+        at = tuple(c * n for c, n in zip((w, (u + 1) / 2, (v + 1) / 2), self.grid.cells, strict=True))
         return self.grid.interpolate(at, inside)
 
 
@@ -111,7 +111,7 @@ def depth_visibility(
             grids.append(None)
             continue
         clear = jnp.exp(-depth_nodes(space, scene, medium, texels, layers, samples))
-        grids.append(ClearGrid(space, grid_of(clear)))
+        grids.append(ClearGrid(space, Grid.of(clear)))
     return DepthVisibility(scene.volume.world_from_grid, tuple(grids))
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jvr.effects.cells import AbstractGrid, grid_of
+from jvr.effects.grid import Grid
 from jvr.effects.natural_light import NaturalLight, natural_light
 from jvr.effects.radiance_transfer import (
     CHUNK,
@@ -19,7 +19,7 @@ from jvr.effects.radiance_transfer import (
     node_positions,
     project_nodes,
 )
-from jvr.march.march import AbstractVisibility, Medium
+from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.harmonics.algebra import product_matrix
 from jvr.model.harmonics.basis import count
@@ -32,7 +32,7 @@ class TransferVisibility(AbstractVisibility):
     """What `inner` says of the scene's lights and, as one more light, of the environment: its share that arrives in each colour, or the
     coefficients of what arrives, all colours of the first, then of the next."""
 
-    grid: AbstractGrid
+    grid: Grid
     scale: tuple[float, float, float] = eqx.field(static=True)
     inner: AbstractVisibility | None
     lights: int = eqx.field(static=True)
@@ -42,11 +42,6 @@ class TransferVisibility(AbstractVisibility):
         own = none if self.inner is None else self.inner.transmittances(points, wanted, reverse=reverse)
         at = tuple(c * f for c, f in zip(points.p, self.scale, strict=True))
         return (*own, self.grid.interpolate(at, wanted))
-
-    @property
-    def is_sharp(self) -> bool:
-        # Nodes are further apart than samples.
-        return self.inner is not None
 
     @property
     def stats(self) -> Any:
@@ -74,7 +69,7 @@ def transfer_visibility(scene: Scene, medium: Medium, inner: AbstractVisibility 
         arriving = _shares(projected, coefficients, light)
     shape = coefficients.shape[:3]
     x, y, z = ((m - 1) / (n - 1) if n > 1 else 0.0 for n, m in zip(scene.volume.shape, shape, strict=True))
-    return TransferVisibility(grid_of(arriving), (x, y, z), inner, lights)
+    return TransferVisibility(Grid.of(arriving), (x, y, z), inner, lights)
 
 
 def transfer_of(scene: Scene) -> RadianceTransfer:

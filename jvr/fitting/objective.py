@@ -16,7 +16,8 @@ from jvr.fitting.losses import AbstractPrior, SquaredError
 from jvr.fitting.observations import Observations, Samples, observed_medium, seen_in_fit
 from jvr.fitting.unknowns import Exposed, Unknowns
 from jvr.march.differentiation import AbstractAdjoint, Forward, Replay, Rows
-from jvr.march.march import Marched, MarchOptions, Medium
+from jvr.march.march import Marched, MarchOptions
+from jvr.march.medium import Medium
 from jvr.march.rows import TableRows, table_rows
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera

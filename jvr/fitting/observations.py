@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jvr.march.fields import KeptField, VoxelField
-from jvr.march.march import AbstractVisibility, Medium
+from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
 from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.model.camera import AbstractCamera

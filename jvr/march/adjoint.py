@@ -23,26 +23,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jvr.march.batch import pooled_while
-from jvr.march.march import (
-    Lanes,
-    Marched,
-    MarchOptions,
-    Medium,
-    Noted,
-    Stretch,
-    for_derivatives,
-    integrate,
-    lanes_of,
-    lit,
-    march,
-    opacity,
-    places,
-    resample,
-    shown,
-    through,
-    transmittance,
-)
+from jvr.march.march import Marched, MarchOptions, Noted, integrate, march
+from jvr.march.medium import Medium, for_derivatives
+from jvr.march.segments import Lanes, Stretch, lanes_of, lit, places, resample, shown
 from jvr.march.steps import Rays, Sample, points_at, segment
+from jvr.march.sums import opacity, through, transmittance
 from jvr.numerics import computed_once, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 

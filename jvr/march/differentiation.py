@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from jvr.march.adjoint import Inputs, is_there, replay_march
-from jvr.march.march import Marched, MarchOptions, Medium, for_derivatives, march
+from jvr.march.march import Marched, MarchOptions, march
+from jvr.march.medium import Medium, for_derivatives
 from jvr.march.rows import TableRows, table_rows
 from jvr.march.steps import Rays
 from jvr.model.transfer import AbstractTable, AbstractTransfer

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Int, UInt
 
-from jvr.march.march import AbstractField
+from jvr.march.medium import AbstractField
 from jvr.march.steps import Point, Sample
 from jvr.model.normals import AbstractNormals
 from jvr.model.volume import Volume

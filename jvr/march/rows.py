@@ -18,19 +18,11 @@ from jaxtyping import Array, Float, Int
 
 from jvr.march.adjoint import BackLanes, Behind, segment_cotangents, step_back
 from jvr.march.batch import pooled_while
-from jvr.march.march import (
-    Marched,
-    MarchOptions,
-    Medium,
-    Stretch,
-    for_derivatives,
-    integrate,
-    lanes_of,
-    light_at,
-    shown,
-    transmittance,
-)
+from jvr.march.march import Marched, MarchOptions, integrate
+from jvr.march.medium import Medium, for_derivatives
+from jvr.march.segments import Stretch, lanes_of, light_at, shown
 from jvr.march.steps import Rays, points_at, segment
+from jvr.march.sums import transmittance
 from jvr.model.transfer import AbstractTable, Classified
 from jvr.types import Channels, Scalar
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jvr.march.march import AbstractShader
+from jvr.march.medium import AbstractShader
 from jvr.march.steps import Point, Sample
 from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbstractOpticalModel
@@ -48,7 +48,7 @@ class OpticalShader(AbstractShader):
 
 
 class LightPathShader(OpticalShader):
-    """What light passes on its way to a point: extinction alone, and no more than `densest` of it (see `jvr.march.march.DENSEST`)."""
+    """What light passes on its way to a point: extinction alone, and no more than `densest` of it (see `jvr.march.medium.DENSEST`)."""
 
     densest: Scalar
 

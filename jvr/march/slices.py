@@ -23,8 +23,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.march.compact import for_each, map_selected, write
-from jvr.march.march import Sums, add, join, opacity, opaque_depth, through, transmittance
 from jvr.march.oracle import DistanceField
+from jvr.march.sums import Sums, add, join, opacity, opaque_depth, through, transmittance
 from jvr.model.volume import Volume
 from jvr.types import Channels, Scalar, Triple
 

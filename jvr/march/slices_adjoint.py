@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jvr.march.adjoint import is_there
 from jvr.march.compact import accumulate, for_each
 from jvr.march.fields import VoxelField
-from jvr.march.march import Marched, Sums, join, through, transmittance
+from jvr.march.march import Marched
 from jvr.march.slices import (
     End,
     Gathered,
@@ -41,6 +41,7 @@ from jvr.march.slices import (
     take_slice,
 )
 from jvr.march.steps import Point, Sample
+from jvr.march.sums import Sums, join, through, transmittance
 from jvr.types import Channels
 
 

@@ -53,8 +53,8 @@ class AbstractShadows(eqx.Module):
 
     @abc.abstractmethod
     def prepared(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
-        """A `jvr.march.march.AbstractVisibility` of these lights, made once for a picture; differentiable. `medium`: what light passes
-        through, a `jvr.march.march.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""
+        """A `jvr.march.medium.AbstractVisibility` of these lights, made once for a picture; differentiable. `medium`: what light passes
+        through, a `jvr.march.medium.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""
 
     def coarser(self) -> tuple["AbstractShadows", ...]:
         """Cheaper ways to about the same shadows, one notch coarser."""

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume, gradients_at_voxels
-from jvr.numerics import add_runs, divide_or_zero, read_run
+from jvr.numerics import add_runs, divide_or_zero, read_at
 from jvr.types import Channels, Scalar, Triple
 
 # The scalar, its derivatives along the grid's axes, and scalars around the point: empty where they are not needed.
@@ -51,7 +51,7 @@ class AnalyticGradient(AbstractNormals):
     the next (the field between cells has kinks). The default."""
 
     def resample(self, volume: Volume, p: Triple) -> Resampled:
-        s, gradient = jax.value_and_grad(volume.sample)(p)
+        s, gradient = jax.value_and_grad(lambda p: volume.sample(p, in_runs=True))(p)
         return s, gradient, ()
 
     def deposit(self, volume: Volume, total: tuple[Volume, Any], p: Triple, cotangent: Resampled) -> tuple[Volume, Any]:
@@ -166,10 +166,10 @@ class PrecomputedGradient(AbstractNormals):
 
     def resample(self, volume: Volume, p: Triple) -> Resampled:
         assert self.gradients is not None
-        rows, total = self.gradients.reshape(-1, 3), jnp.zeros(3, self.gradients.dtype)
+        numbers, total = self.gradients.reshape(-1), [jnp.zeros_like(p[0])] * 3
         for start, weights in volume.interpolation.stencil(volume.shape, p):
-            run = read_run(rows, start, len(weights))
-            total += sum(w * run[i] for i, w in enumerate(weights))
+            for i, w in enumerate(weights):
+                total = [t + w * read_at(numbers, 3 * (start + i) + c) for c, t in enumerate(total)]
         return volume.sample(p), (total[0], total[1], total[2]), ()
 
     def deposit(self, volume: Volume, total: tuple[Volume, Any], p: Triple, cotangent: Resampled) -> tuple[Volume, Any]:

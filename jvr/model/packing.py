@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8, UInt32
 
-from jvr.numerics import read_run
+from jvr.numerics import read_at
 from jvr.types import Triple
 
 
@@ -22,10 +22,10 @@ class Squares(eqx.Module):
         x, y, z = (x - i if n > 1 else jnp.zeros_like(x) for x, i, n in zip(p, low, self.entries.shape, strict=True))
         i, j, k = (i.astype(jnp.int32) for i in low)
         flat, start = self.entries.reshape(-1), (i * ny + j) * nz + k
-        front = _bilinear(read_run(flat, start, 1)[0], y, z)
+        front = _bilinear(read_at(flat, start), y, z)
         if nx == 1:
             return front
-        back = _bilinear(read_run(flat, start + ny * nz, 1)[0], y, z)
+        back = _bilinear(read_at(flat, start + ny * nz), y, z)
         return (1 - x) * front + x * back
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.checks import affine, float_array, require
 from jvr.model.packing import Squares, squares_of
-from jvr.numerics import add_runs, read_run, transformed, turned
+from jvr.numerics import add_runs, read_at, read_run, transformed, turned
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
 
 
@@ -35,7 +35,7 @@ class Trilinear(AbstractInterpolation):
 
     def stencil(self, shape: tuple[int, int, int], p: Triple) -> tuple[Run, ...]:
         (i, wx), (j, wy), (k, wz) = (_linear(x, n) for x, n in zip(p, shape, strict=True))
-        # Runs of voxels that lie side by side in memory: half as many reads and writes as single voxels.
+        # Runs of voxels that lie side by side in memory: a derivative writes half as often as it would single voxels.
         return tuple(
             Run(((i + a) * shape[1] + j + b) * shape[2] + k, tuple(wx[a] * wy[b] * w for w in wz))
             for a in range(len(wx))
@@ -177,17 +177,23 @@ class Volume(eqx.Module):
         lower, upper = zip(*[(0.0, n - 1.0) if n > 1 else (-0.5, 0.5) for n in self.shape], strict=True)
         return lower, upper
 
-    def sample(self, p: Triple) -> Scalar:
-        """The scalar `s` at one grid position `p`; positions outside of the domain are the caller's to exclude."""
-        return self.slope * self.interpolate(p) + self.intercept
+    def sample(self, p: Triple, *, in_runs: bool = False) -> Scalar:
+        """The scalar `s` at one grid position `p`; positions outside of the domain are the caller's to exclude. `in_runs`: how voxels are
+        read (see `interpolate`)."""
+        return self.slope * self.interpolate(p, in_runs=in_runs) + self.intercept
 
-    def interpolate(self, p: Triple) -> Scalar:
-        """The stored voxels interpolated at one grid position, before slope and intercept."""
+    def interpolate(self, p: Triple, *, in_runs: bool = False) -> Scalar:
+        """The stored voxels interpolated at one grid position, before slope and intercept.
+
+        Voxels are read one at a time, within the kernel that makes the one number of them. With `in_runs` they are read into memory, so
+        that several numbers, such as a gradient, are made of them and the compiler does not read anew for each.
+        """
         if self.squares is not None:
             return self.squares.interpolate(p)
         voxels, value = self.values.reshape(-1), jnp.zeros_like(p[0])
         for start, weights in self.interpolation.stencil(self.shape, p):
-            run = read_run(voxels, start, len(weights))
+            n = len(weights)
+            run = read_run(voxels, start, n) if in_runs else [read_at(voxels, start + i) for i in range(n)]
             value += sum(w * run[i].astype(w.dtype) for i, w in enumerate(weights))
         return value
 

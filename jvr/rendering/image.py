@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.march import AbstractVisibility, Marched, MarchOptions
+from jvr.march.march import Marched, MarchOptions
+from jvr.march.medium import AbstractVisibility
 from jvr.march.occupancy import Occupancy
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera

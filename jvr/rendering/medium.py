@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from jvr.march.fields import VoxelField
-from jvr.march.march import DENSEST, AbstractShader, AbstractVisibility, Medium
+from jvr.march.medium import DENSEST, AbstractShader, AbstractVisibility, Medium
 from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.quadrature import PreIntegrated
 from jvr.march.shaders import GradientFrame, LightPathShader, OpticalShader, PreIntegratedShader

@@ -1,0 +1,93 @@
+"""What rays march through: the contracts between the loop and what fills it.
+
+The loop knows no effect by name. It is handed a `Medium`: a field that is resampled at a point, a shader that turns what was resampled
+into emitted radiance and optical depth, and where the scene asks for it, how much light arrives.
+"""
+
+import abc
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, Bool
+
+from jvr.march.occupancy import Occupancy
+from jvr.march.steps import Point, Sample
+from jvr.model.transfer import Classified
+from jvr.types import Channels, Scalar
+
+# Optical depth of a segment, and of a voxel on the way of light, beyond which denser media are lit alike: light gets about as deep into
+# them as the eye sees. Without it the two would be compared at distances that a position in single precision cannot tell apart.
+DENSEST = 64.0
+
+
+class AbstractField(eqx.Module):
+    """What is resampled along rays; its arrays may be large."""
+
+    @abc.abstractmethod
+    def resample(self, point: Point) -> Sample:
+        """What is known at one point, but for the light there."""
+
+    @abc.abstractmethod
+    def deposit(self, gradient: "AbstractField", points: Point, cotangent: Sample) -> "AbstractField":
+        """Adds the derivative of `sum(cotangent * resample(points))` to `gradient`, in place where the compiler can; leaves of
+        `gradient` that are `None` are not asked for."""
+
+
+class AbstractVisibility(eqx.Module):
+    """How much of each light reaches a point, and of that from all around where the scene asks for it."""
+
+    @abc.abstractmethod
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
+        """For each light, the transmittance between it and each of a batch of points, one or three channels, or none where nothing can
+        shade it. What is not `wanted` may be anything finite.
+
+        Differentiable in reverse mode where `reverse` says so, else in forward mode.
+        """
+
+    @property
+    @abc.abstractmethod
+    def stats(self) -> Any:
+        """What is to be reported about it, or `None`."""
+
+
+class AbstractShader(eqx.Module):
+    """What a segment looks like: everything between the scalar and the eye. Its arrays are small."""
+
+    # Where in a segment the field is resampled, from -1/2 at its front to 1/2 at its back.
+    places: ClassVar[tuple[float, ...]] = (0.0,)
+
+    @abc.abstractmethod
+    def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        """Emitted radiance (three components or none) and optical depth (one, three or none) of one segment of length `dt` whose
+        properties are constant."""
+
+    def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        """The same for a segment around `point`, from what is known at `places`."""
+        sample = self.prepare(transfer, samples[0], point)
+        return self.segment(self.classify(transfer, sample), sample, point, dt)
+
+    def prepare(self, transfer: Any, sample: Sample, point: Point) -> Sample:
+        """The sample with its gradient in the world."""
+        return sample
+
+    def classify(self, transfer: Any, sample: Sample) -> Classified:
+        """Colour and extinction of a prepared sample."""
+        return transfer.evaluate(sample.s)
+
+
+class Medium(NamedTuple):
+    """What rays march through: resampled, classified, shaded; where `occupancy` is not `None`, only in visible bricks; where `shadows`
+    is not `None`, each sample knows how much light reaches it."""
+
+    field: AbstractField
+    transfer: Any  # what `shader.look` reads: an AbstractTransfer, or one prepared for the shader
+    shader: AbstractShader
+    occupancy: Occupancy | None = None
+    shadows: AbstractVisibility | None = None
+
+
+def for_derivatives(medium: Medium) -> Medium:
+    """What a march goes through whose derivative with respect to the transfer function is taken: an empty brick may have one, since
+    that of extinction at zero is not zero."""
+    leaps = medium.occupancy is not None and medium.occupancy.in_derivatives
+    return medium if leaps else medium._replace(occupancy=None)

@@ -1,0 +1,141 @@
+"""One segment of every ray: which one comes next, what it looks like, and how much light reaches it."""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jvr.march.medium import DENSEST, Medium
+from jvr.march.steps import Point, Rays, Sample, points_at, segment, segment_count
+from jvr.model.transfer import Classified
+from jvr.numerics import computed_once, mean_depth
+from jvr.types import Channels, Scalar
+
+# Leaps before a ray is started.
+FIRST_LEAPS = 4
+
+
+class Lanes(NamedTuple):
+    """A batch of rays: their indices in the whole batch and their numbers of segments."""
+
+    rays: Rays
+    ray: Int[Array, "rays"]
+    segments: Int[Array, "rays"]
+
+
+class Stretch(NamedTuple):
+    """One segment of every ray: its index, the distance of its middle from the entry, its length, and whether it is there."""
+
+    rays: Rays
+    ray: Int[Array, "rays"]
+    k: Int[Array, "..."]
+    u: Float[Array, "rays"]
+    extent: Float[Array, "rays"]
+    inside: Bool[Array, "rays"]
+
+
+def lanes_of(rays: Rays, dt: Scalar) -> Lanes:
+    """All rays, numbered."""
+    count = segment_count(rays.length, dt)
+    return Lanes(rays, jnp.arange(count.size, dtype=jnp.int32), count)
+
+
+def leap(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"]) -> Int[Array, "rays"]:
+    """The next segment, from `k` on, that may have a sample in a visible brick, or the number of segments."""
+    if medium.occupancy is None:
+        return k
+    extent, u = segment(k, lanes.segments, lanes.rays.length, dt)
+    within = len(medium.shader.places) > 1
+    first = u - extent / 2 if within else u
+    return jnp.minimum(k + medium.occupancy.leap(lanes.rays, first, dt, within=within), lanes.segments)
+
+
+def first_visible(medium: Medium, lanes: Lanes, dt: Scalar) -> Int[Array, "rays"]:
+    """The segment that each ray starts with: a few leaps on from its entry. Most of the rays that see nothing end here, and what is
+    left of the others says better how long they will take."""
+    first = jnp.zeros_like(lanes.segments)
+    if medium.occupancy is None:
+        return first
+    return jax.lax.fori_loop(0, FIRST_LEAPS, lambda _, k: leap(medium, lanes, dt, k), first)
+
+
+def shown(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]) -> Int[Array, "rays"]:
+    """`count`, the number of segments, and 0 for rays whose segment `k` is not to be seen. A leap may end in another empty brick; where
+    empty means negligible, both directions have to take the same segments."""
+    if medium.occupancy is None or not medium.occupancy.in_derivatives:
+        return count
+    _, u = segment(k, count, lanes.rays.length, dt)
+    return jnp.where(medium.occupancy.shows(lanes.rays, u), count, 0)
+
+
+def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
+    """Emission and optical depth of segment `k` of every ray, and the distance of its midpoint; zero beyond `count`."""
+    extent, u = segment(k, count, lanes.rays.length, dt)
+    sampled = places(medium, lanes.rays, lanes.ray, k, u, extent)
+    where = Stretch(lanes.rays, lanes.ray, k, u, extent, k < count)
+    samples = lit(medium, where, resample(medium, sampled, k < count), reverse=False)
+    point = points_at(lanes.rays, lanes.ray, k, u)
+    emitted, dtau = jax.vmap(medium.shader.look, in_axes=(None, 0, 0, 0))(medium.transfer, samples, point, extent)
+    return emitted, dtau, u
+
+
+def places(
+    medium: Medium,
+    rays: Rays,
+    ray: Int[Array, "rays"],
+    k: Int[Array, "..."],
+    u: Float[Array, "rays"],
+    extent: Float[Array, "rays"],
+) -> list[Point]:
+    """Where a segment around `u` is resampled."""
+    return [points_at(rays, ray, k, u + at * extent if at else u) for at in medium.shader.places]
+
+
+def resample(medium: Medium, sampled: list[Point], proof: Bool[Array, "rays"]) -> tuple[Sample, ...]:
+    """The field at each of the places, once for all channels of the shader; `proof` as in `computed_once`."""
+    return computed_once(proof, tuple(jax.vmap(medium.field.resample)(points) for points in sampled))
+
+
+def classify_at(medium: Medium, points: Point, proof: Bool[Array, "points"]) -> tuple[Classified, Sample]:
+    """Colour and extinction at a batch of points, and what the shader knows of them; `proof` as in `computed_once`."""
+    samples = computed_once(proof, jax.vmap(medium.field.resample)(points))
+    prepared = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, points)
+    return jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, prepared), prepared
+
+
+def lit(medium: Medium, where: Stretch, samples: tuple[Sample, ...], *, reverse: bool) -> tuple[Sample, ...]:
+    """The samples of a segment with the light that reaches it, where that is asked for."""
+    if medium.shadows is None:
+        return samples
+    shader, middle = medium.shader, points_at(where.rays, where.ray, where.k, where.u)
+    classify = lambda sample, point: shader.classify(medium.transfer, shader.prepare(medium.transfer, sample, point)).sigma_t
+    sigma_t = [sigma for sample in samples for sigma in jax.vmap(classify)(sample, middle)]
+    light = light_at(medium, where, sigma_t, reverse=reverse)
+    return tuple(sample._replace(light=light) for sample in samples)
+
+
+def light_at(medium: Medium, where: Stretch, sigma_t: Sequence[Array], *, reverse: bool) -> tuple[Channels, ...]:
+    """How much light reaches a segment with these extinctions.
+
+    It is looked up where the segment's own emission comes from on average, in front of its middle: in the middle of an opaque one it
+    is dark, though its front is not.
+    """
+    assert medium.shadows is not None
+    dtau = jnp.minimum(sum(sigma_t[1:], sigma_t[0]) / len(sigma_t) * where.extent, DENSEST)
+    u = computed_once(where.inside, where.u + where.extent * (mean_depth(dtau) - 0.5))
+    points = points_at(where.rays, where.ray, where.k, u)
+    # Without extinction there is nothing to see; but where nothing is left out it has a derivative, and between the ends of a segment
+    # there may be what is at neither.
+    everywhere = medium.occupancy is None or len(medium.shader.places) > 1
+    wanted = where.inside if everywhere else where.inside & functools.reduce(jnp.logical_or, [sigma != 0 for sigma in sigma_t])
+    return computed_once(where.inside, medium.shadows.transmittances(points, wanted, reverse=reverse))
+
+
+def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:
+    """How many channels the medium emits and absorbs in, by shape alone."""
+    one = lanes_of(jax.tree.map(lambda x: x[:1], rays), dt)
+    emitted, dtau, _ = jax.eval_shape(lambda: take_segment(medium, one, dt, jnp.zeros_like(one.segments), one.segments))
+    return len(emitted), len(dtau)
