@@ -8,6 +8,7 @@ A material function has two parts: `tinted` is multiplied with the colour of the
 light, as highlights of everything but metals do.
 """
 
+import abc
 import math
 from typing import ClassVar
 
@@ -38,12 +39,9 @@ class LambertBRDF(AbstractBRDF):
         return matte(self.reflectance, w_i), ()
 
 
-class PhongBRDF(AbstractBRDF):
-    """Matte and a glossy lobe about the mirrored light (Lafortune and Willems 1994, Using the modified Phong reflectance model for
-    physically based rendering): tinted `diffuse / pi max(n . w_i, 0)`, plain `specular (e + 2) / (2 pi) max(r . w_o, 0)^e max(n . w_i, 0)`.
-
-    Reciprocal. The lobe reflects the share `specular` to an eye that looks straight down, less to others: what of the lobe lies below
-    the surface is lost.
+class AbstractGlossyBRDF(AbstractBRDF):
+    """A matte part, tinted, and a glossy lobe in the light's own colour: `diffuse / pi max(n . w_i, 0)` and
+    `specular lobe(w_o, w_i) max(n . w_i, 0)`, zero where either direction is below the surface.
 
     **Arguments:** `diffuse`, `specular`: in [0, 1], each a number or `(3,)`; where their sum is at most 1 no more is reflected than
     arrives. `exponent`: `e`, a number, not negative. All differentiable. **Raises** `ValueError` otherwise.
@@ -56,36 +54,46 @@ class PhongBRDF(AbstractBRDF):
 
     def __init__(self, diffuse: ArrayLike = 0.7, specular: ArrayLike = 0.3, exponent: ArrayLike = 30.0):
         self.diffuse, self.specular = share(diffuse, "diffuse", (), (3,)), share(specular, "specular", (), (3,))
-        self.exponent = _exponent(exponent)
+        self.exponent = float_array(exponent, "exponent", ())
+        require(
+            self.exponent, lambda e: np.isfinite(e) & (e >= 0), "exponent must be finite and not negative; 30 is a soft highlight"
+        )
+
+    @abc.abstractmethod
+    def lobe(self, w_o: Triple, w_i: Triple) -> Float[Array, "..."]:
+        """The glossy lobe, per solid angle, where both directions are above the surface."""
 
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
-        mirrored = (-w_i[0], -w_i[1], w_i[2])
-        lobe = (self.exponent + 2.0) / (2.0 * math.pi) * power_of_cosine(mirrored, w_o, self.exponent)
-        return matte(self.diffuse, w_i), _gloss(self.specular, lobe, w_o, w_i)
+        received = jnp.where(above(w_o, w_i), self.lobe(w_o, w_i) * w_i[2], 0.0)
+        return matte(self.diffuse, w_i), tuple(s * received for (s,) in components(self.specular))
 
 
-class BlinnPhongBRDF(AbstractBRDF):
-    """As `PhongBRDF` with the lobe `specular (e + 2) (e + 4) / (8 pi (2^(-e/2) + e)) max(n . h, 0)^e max(n . w_i, 0)`, `h` half-way
-    between the directions to eye and light.
+class PhongBRDF(AbstractGlossyBRDF):
+    """Matte and a glossy lobe about the mirrored light, `(e + 2) / (2 pi) max(r . w_o, 0)^e` (Lafortune and Willems 1994, Using the
+    modified Phong reflectance model for physically based rendering).
 
-    The factor makes the share reflected straight up exactly `specular` (Giesen 2009, Phong and Blinn-Phong normalization factors); the
-    common `(e + 8) / (8 pi)` reflects up to 8 % more than arrives. Exponent 0 is Lambert's.
+    Reciprocal. The lobe reflects the share `specular` to an eye that looks straight down, less to others: what of the lobe lies below
+    the surface is lost. Arguments as `AbstractGlossyBRDF`.
     """
 
-    about: ClassVar[About] = "both"
-    diffuse: Float[Array, "..."]
-    specular: Float[Array, "..."]
-    exponent: Scalar
+    def lobe(self, w_o: Triple, w_i: Triple) -> Float[Array, "..."]:
+        mirrored = (-w_i[0], -w_i[1], w_i[2])
+        return (self.exponent + 2.0) / (2.0 * math.pi) * power_of_cosine(mirrored, w_o, self.exponent)
 
-    def __init__(self, diffuse: ArrayLike = 0.7, specular: ArrayLike = 0.3, exponent: ArrayLike = 30.0):
-        self.diffuse, self.specular = share(diffuse, "diffuse", (), (3,)), share(specular, "specular", (), (3,))
-        self.exponent = _exponent(exponent)
 
-    def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
+class BlinnPhongBRDF(AbstractGlossyBRDF):
+    """Matte and a glossy lobe `(e + 2) (e + 4) / (8 pi (2^(-e/2) + e)) max(n . h, 0)^e`, `h` half-way between the directions to eye and
+    light.
+
+    The factor makes the share reflected straight up exactly `specular` (Giesen 2009, Phong and Blinn-Phong normalization factors); the
+    common `(e + 8) / (8 pi)` reflects up to 8 % more than arrives. Exponent 0 is Lambert's. Arguments as `AbstractGlossyBRDF`.
+    """
+
+    def lobe(self, w_o: Triple, w_i: Triple) -> Float[Array, "..."]:
         half, _ = direction_and_length(tuple(o + i for o, i in zip(w_o, w_i, strict=True)))
         e, normal = self.exponent, (jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
         factor = (e + 2.0) * ((e + 4.0) / (8.0 * math.pi * (jnp.exp2(-0.5 * e) + e)))
-        return matte(self.diffuse, w_i), _gloss(self.specular, factor * power_of_cosine(half, normal, e), w_o, w_i)
+        return factor * power_of_cosine(half, normal, e)
 
 
 class PhaseBRDF(AbstractBRDF):
@@ -138,14 +146,3 @@ def share(value: ArrayLike, name: str, *shapes: tuple[int, ...]) -> Float[Array,
     array = float_array(value, name, *shapes)
     require(array, lambda a: (a >= 0) & (a <= 1), f"{name} must be in [0, 1], a share of the light")
     return array
-
-
-def _exponent(value: ArrayLike) -> Scalar:
-    exponent = float_array(value, "exponent", ())
-    require(exponent, lambda e: np.isfinite(e) & (e >= 0), "exponent must be finite and not negative; 30 is a soft highlight")
-    return exponent
-
-
-def _gloss(specular: Float[Array, "..."], lobe: Float[Array, "..."], w_o: Triple, w_i: Triple) -> Channels:
-    received = jnp.where(above(w_o, w_i), lobe * w_i[2], 0.0)
-    return tuple(s * received for (s,) in components(specular))
