@@ -377,10 +377,8 @@ def loss(p, distances, optical=jvr.EmissionAbsorption()):
     return total + jnp.sum(picture.depth * weights[..., 4]), picture.stats.sampling
 
 
-@pytest.mark.parametrize(
-    "optical",
-    [jvr.EmissionAbsorption(), *(pytest.param(o, marks=pytest.mark.slow) for o in (jvr.EmissionOnly(), jvr.AbsorptionOnly()))],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("optical", [jvr.EmissionAbsorption(), jvr.EmissionOnly(), jvr.AbsorptionOnly()])
 def test_gradients_against_differences_with_the_placement_frozen(x64, optical):
     p = parameters()
     if not isinstance(optical, jvr.EmissionAbsorption):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import compiled
 
 import jvr
 from jvr.model.microfacet import ggx, reflectances, visibility
@@ -222,11 +223,11 @@ def test_derivatives_are_those_of_finite_differences(x64, name):
 
     x = jnp.concatenate([jnp.asarray(parameters, float), jnp.zeros(6)])
     step = 1e-6
-    over = jax.jit(jax.vmap(value))
+    over = compiled(jax.vmap(value))
     differences = (over(x + step * jnp.eye(x.size)) - over(x - step * jnp.eye(x.size))) / (2 * step)
     # Central differences in double precision: 1e-10 of rounding over the step, and the step squared.
     for jacobian in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(np.moveaxis(jax.jit(jacobian(value))(x), -1, 0), differences, rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(np.moveaxis(compiled(jacobian(value))(x), -1, 0), differences, rtol=1e-5, atol=1e-7)
 
 
 def extreme_directions():

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from jvr.march.steps import Rays
 from jvr.model.bricks import Bricks
 from jvr.model.transfer import AbstractTransfer
-from jvr.numerics import computed_once
+from jvr.numerics import computed_once, read_at
 from jvr.types import Scalar
 
 # Radii of the empty cubes that are told apart, in bricks. Each is the last one plus at most itself plus one (see `_reach`).
@@ -61,7 +61,7 @@ class Occupancy(eqx.Module):
         shape = self.reach.shape
         b = [jnp.clip(jnp.floor(x / self.size), 0, n - 1) for x, n in zip(p, shape, strict=True)]
         index = (b[0].astype(jnp.int32) * shape[1] + b[1].astype(jnp.int32)) * shape[2] + b[2].astype(jnp.int32)
-        return b, self.reach.reshape(-1).at[index].get(mode="promise_in_bounds").astype(p[0].dtype)
+        return b, read_at(self.reach.reshape(-1), index).astype(p[0].dtype)
 
 
 def occupancy_of(

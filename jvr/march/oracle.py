@@ -20,7 +20,7 @@ from jvr.model.bricks import bricks_of
 from jvr.model.optical import AbstractOpticalModel
 from jvr.model.transfer import LinearTransfer, LutTransfer
 from jvr.model.volume import Volume
-from jvr.numerics import one_minus_exp
+from jvr.numerics import one_minus_exp, read_at
 from jvr.types import Scalar, Triple
 
 
@@ -36,7 +36,7 @@ class DistanceField(eqx.Module):
             jnp.clip(jnp.floor(x / self.brick), 0, n - 1).astype(jnp.int32) for x, n in zip(p, self.distance.shape, strict=True)
         ]
         flat = (index[0] * self.distance.shape[1] + index[1]) * self.distance.shape[2] + index[2]
-        return self.distance.reshape(-1).at[flat].get(mode="promise_in_bounds")
+        return read_at(self.distance.reshape(-1), flat)
 
 
 class AbstractOracle(eqx.Module):

@@ -192,11 +192,12 @@ def _three(v: Float[Array, "3"]) -> Triple:
 
 
 def _interpolate(table: AbstractTable, u: Scalar) -> Classified:
-    # One array, so that one read brings both rows around `u` with all their columns.
+    # Each row beside the next, so that one read brings both around `u` with all their columns.
     rows = jnp.stack([*_columns(table.rgb), *_columns(table.sigma_t)], axis=1)
+    pairs, columns = jnp.concatenate([rows[:-1], rows[1:]], axis=1), rows.shape[1]
     low = jnp.clip(jnp.floor(u), 0, rows.shape[0] - 2)
     fraction = u - low
-    below, above = read_run(rows, low.astype(jnp.int32), 2)
+    pair = read_run(pairs, low.astype(jnp.int32), 1)[0]
     # The weighted sum, not a + f (b - a): at an end of an interval it returns the entry exactly.
-    r, g, b, *sigma_t = ((1 - fraction) * below[c] + fraction * above[c] for c in range(rows.shape[1]))
+    r, g, b, *sigma_t = ((1 - fraction) * pair[c] + fraction * pair[columns + c] for c in range(columns))
     return Classified((r, g, b), tuple(sigma_t))
