@@ -265,7 +265,7 @@ def test_values_and_derivatives_are_finite_at_extremes(name):
     w_o, w_i = extreme_directions()
     x = jnp.asarray(values, jnp.float32)
     value = lambda x, w_o, w_i: jnp.sum(total(make(x), w_o, w_i))
-    over = lambda f: jax.jit(jax.vmap(jax.vmap(f, (None, 0, 0)), (0, None, None)))(x, w_o, w_i)
+    over = lambda f: compiled(jax.vmap(jax.vmap(f, (None, 0, 0)), (0, None, None)))(x, w_o, w_i)
     forward = lambda *p: jax.jvp(value, p, jax.tree.map(jnp.ones_like, p))
     assert np.all(np.asarray(over(value)) >= 0)
     for f in (value, jax.grad(value, (0, 1, 2)), forward):

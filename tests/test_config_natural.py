@@ -290,6 +290,7 @@ def test_a_fit_computes_beforehand_what_it_does_not_find(unknowns, keep_material
     assert found.scene.radiance_transfer is not None
 
 
+@pytest.mark.slow
 def test_radiance_transfer_with_the_materials_colour_is_that_of_the_start():
     """Kept for an unknown material as it is, and not announced as that of another."""
     found = job(["material.reflectance"], "radiance_transfer={rays=4,resolution=0.1,bleeding='material'}")

@@ -104,7 +104,13 @@ def test_every_parameter_at_once(x64):
 
 
 @pytest.mark.parametrize(
-    ("kind", "rows"), [("linear, coloured", (jax.grad,)), ("table", ()), ("Gaussians, coloured", (jax.jacfwd, jax.grad))]
+    ("kind", "rows"),
+    [
+        ("linear, coloured", (jax.grad,)),
+        ("table", ()),
+        ("Gaussians", ()),
+        pytest.param("Gaussians, coloured", (jax.jacfwd, jax.grad), marks=pytest.mark.slow),
+    ],
 )
 def test_transfer_functions(kind, rows, x64):
     check_every_way(parameters(TRANSFERS[kind]()), ("transfer", "intercept"), rows=rows)
@@ -127,6 +133,7 @@ def test_entry_and_exit_through_a_clipping_box(x64):
     check_every_way(p, ("clipping", "eye", "extent"), rows=(), parallel=True)
 
 
+@pytest.mark.slow
 def test_tiles_and_no_jit(x64):
     """Gradients that add up over tiles which do not divide the picture, without `jit`."""
     p = parameters(TRANSFERS["linear"]())
@@ -137,7 +144,12 @@ def test_tiles_and_no_jit(x64):
 
 @pytest.mark.parametrize(
     ("transform", "adjoint"),
-    [(jax.grad, jvr.Replay()), (jax.jacfwd, jvr.Forward()), (jax.grad, jvr.Rows()), (jax.jacfwd, jvr.Rows())],
+    [
+        (jax.grad, jvr.Replay()),
+        (jax.jacfwd, jvr.Forward()),
+        (jax.grad, jvr.Rows()),
+        pytest.param(jax.jacfwd, jvr.Rows(), marks=pytest.mark.slow),
+    ],
     ids=["replay", "forward", "rows, reverse", "rows, forward"],
 )
 def test_vmapped(transform, adjoint, x64):

@@ -125,6 +125,7 @@ def test_new_numbers_compile_nothing():
     assert len(count) == 2
 
 
+@pytest.mark.slow
 def test_new_numbers_of_natural_light_compile_nothing():
     """Light, material, dipole and transfer function; also once all has been computed beforehand."""
     count = []

@@ -62,6 +62,7 @@ def test_a_light_turns_about_the_vertical():
     np.testing.assert_allclose(phase_recovery.turned(scene, 90.0).lights[0].direction, [-y, x, z], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_true_values_are_those_of_the_configuration():
     config = read_config(phase_recovery.CONFIG, phase_recovery.LOBES)
     np.testing.assert_allclose(phase_recovery.true_values(config), [0.7, -0.4, 0.75, 0.8])

@@ -71,7 +71,7 @@ def test_levenberg_marquardt_recovers_the_table():
     [
         pytest.param(jvr.GaussNewton(), 30, 60, id="gauss-newton"),
         pytest.param(jvr.Dogleg(), 40, 60, id="dogleg"),
-        pytest.param(optx.BFGS(rtol=1e-8, atol=1e-10), 150, 38, id="bfgs"),
+        pytest.param(optx.BFGS(rtol=1e-8, atol=1e-10), 150, 38, marks=pytest.mark.slow, id="bfgs"),
         pytest.param(optx.LBFGS(rtol=1e-8, atol=1e-10), 150, 38, marks=pytest.mark.slow, id="lbfgs"),
         pytest.param(optx.OptaxMinimiser(optax.adam(0.2), rtol=0.0, atol=0.0), 150, 38, marks=pytest.mark.slow, id="adam"),
         pytest.param(optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8), 40, 60, marks=pytest.mark.slow, id="optimistix-lm"),
@@ -207,7 +207,9 @@ def test_dssim_needs_a_solver_that_uses_gradients():
     assert result.history[-1].loss < 0.5 * result.history[0].loss
 
 
-@pytest.mark.parametrize("keywords", [{"loss": jvr.AbsoluteError()}, {"priors": (jvr.ColourSmoothness(1e-2),)}])
+@pytest.mark.parametrize(
+    "keywords", [pytest.param({"loss": jvr.AbsoluteError()}, marks=pytest.mark.slow), {"priors": (jvr.ColourSmoothness(1e-2),)}]
+)
 def test_psnr_is_that_of_the_pictures_whatever_is_made_small(keywords):
     result = fit(solver=optx.OptaxMinimiser(optax.adam(0.1), rtol=0.0, atol=0.0), max_steps=6, **keywords)
     rendered = np.concatenate([np.ravel(jvr.render(result.scene, c, SETTINGS).rgb) for c in CAMERAS])

@@ -308,7 +308,7 @@ def test_computed_beforehand_and_in_the_picture_are_the_same(tmp_path):
 
 
 def test_an_outdated_transfer_is_announced():
-    frozen = jvr.precompute(scene(transfer=jvr.RadianceTransfer(rays=8)))
+    frozen = jvr.precompute(scene(transfer=jvr.RadianceTransfer(rays=16), shape=(7, 9, 8)))
     changed = dataclasses.replace(frozen, transfer=linear_transfer(seed=5))
     with pytest.warns(RuntimeWarning, match="another transfer function"):
         jvr.render(changed, perspective(changed.volume, width=4, height=4), SETTINGS)
@@ -384,7 +384,14 @@ GRADIENTS = {
 
 
 # Each takes ten seconds and more to compile.
-SLOW = ("roughness", "transfer function through bleeding", "voxels", "lambert, shares", "dipole")
+SLOW = (
+    "roughness",
+    "transfer function through the transfer",
+    "transfer function through bleeding",
+    "voxels",
+    "lambert, shares",
+    "dipole",
+)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in GRADIENTS])

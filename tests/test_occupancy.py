@@ -121,7 +121,7 @@ def _gradient(wanted, rest, skipping):
     return jax.grad(loss)(wanted)
 
 
-@pytest.mark.parametrize("of", ["everything", "voxels and camera"])
+@pytest.mark.parametrize("of", ["everything", pytest.param("voxels and camera", marks=pytest.mark.slow)])
 def test_gradient_is_the_same(of, x64):
     """With the transfer function among the unknowns nothing is skipped on the way back; without, what is skipped has no gradient."""
     gradient = jax.jit(_gradient, static_argnums=2)
@@ -146,7 +146,8 @@ def faint_scene(rng):
     return jvr.Scene(volume.bricked(1), transfer, background=(0.1, 0.2, 0.3)), perspective(volume, 8, 6)
 
 
-@pytest.mark.parametrize("negligible", [pytest.param(1e-3, marks=pytest.mark.slow), 1e-2])
+@pytest.mark.slow
+@pytest.mark.parametrize("negligible", [1e-3, 1e-2])
 def test_what_is_negligible_stays_below_its_bound(negligible, x64):
     """In every pixel, and in every entry of its derivative in the logarithms of the extinctions, by both ways to take it."""
 

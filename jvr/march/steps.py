@@ -39,8 +39,8 @@ class Point(NamedTuple):
 class Sample(NamedTuple):
     """What is known at a point; parts that nobody asks for are empty.
 
-    `s`: the scalar; `gradient`: its derivatives along the grid axes, or those of the extinction; `neighbours`: scalars around the
-    point, for a gradient of what the transfer function makes of them; `light`: for each light, the transmittance between it and the point.
+    `s`: the scalar; `gradient`: its derivatives along the grid axes, or those of the extinction; `neighbours`: what else a gradient is made
+    of, such as scalars around the point before the transfer function; `light`: for each light, the transmittance between it and the point.
     """
 
     s: Float[Array, "..."]

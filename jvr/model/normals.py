@@ -16,10 +16,11 @@ from jaxtyping import Array, Float
 
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume, gradients_at_voxels
-from jvr.numerics import add_runs, divide_or_zero, read_at
+from jvr.numerics import add_runs, divide_or_zero, read_run
 from jvr.types import Channels, Scalar, Triple
 
-# The scalar, its derivatives along the grid's axes, and scalars around the point: empty where they are not needed.
+# The scalar, its derivatives along the grid's axes, and what else a gradient is made of, such as scalars around the point: empty where
+# they are not needed.
 Resampled = tuple[Float[Array, "..."], Triple, Channels]
 
 
@@ -166,24 +167,25 @@ class PrecomputedGradient(AbstractNormals):
 
     def resample(self, volume: Volume, p: Triple) -> Resampled:
         assert self.gradients is not None
-        numbers, total = self.gradients.reshape(-1), [jnp.zeros_like(p[0])] * 3
+        rows, total = self.gradients.reshape(-1, 3), jnp.zeros(3, self.gradients.dtype)
         for start, weights in volume.interpolation.stencil(volume.shape, p):
-            for i, w in enumerate(weights):
-                total = [t + w * read_at(numbers, 3 * (start + i) + c) for c, t in enumerate(total)]
-        return volume.sample(p), (total[0], total[1], total[2]), ()
+            total += sum(w * read_run(rows, start + i, 1)[0] for i, w in enumerate(weights))
+        # One array: apart, each of its components would read all three anew.
+        return volume.sample(p), (), (total,)
 
     def deposit(self, volume: Volume, total: tuple[Volume, Any], p: Triple, cotangent: Resampled) -> tuple[Volume, Any]:
-        of_value, of_gradient, _ = cotangent
+        of_value, _, (of_gradient,) = cotangent
         own = total[1]
         if own.gradients is not None:
             rows = own.gradients.reshape(-1, 3)
             for starts, weights in jax.vmap(lambda p: volume.interpolation.stencil(volume.shape, p))(p):
-                rows = add_runs(rows, starts, jnp.stack(weights, 1)[..., None] * jnp.stack(of_gradient, -1)[:, None])
+                rows = add_runs(rows, starts, jnp.stack(weights, 1)[..., None] * of_gradient[:, None])
             own = PrecomputedGradient(self.of_opacity, rows.reshape(own.gradients.shape))
         return volume.deposit(total[0], p, of_value), own
 
     def gradient(self, transfer: AbstractTransfer, shape: tuple[int, int, int], p: Triple, resampled: Resampled) -> Triple:
-        return resampled[1]
+        (gradient,) = resampled[2]
+        return gradient[0], gradient[1], gradient[2]
 
 
 def extinction(transfer: AbstractTransfer, s: Scalar) -> Scalar:
