@@ -92,7 +92,7 @@ def sheet(probes: dict[str, np.ndarray], found: dict[tuple[str, str], np.ndarray
         axes.set_axis_off()
     shown = lambda picture: srgb_from_linear(0.8 * picture)
     for axes, name in zip(grid[0], columns, strict=True):
-        title = f"{probes and columns[0].split('.')[0]}, no transfer" if name == "no transfer" else name.split(".")[0]
+        title = f"{columns[0].split('.')[0]}, no transfer" if name == "no transfer" else name.split(".")[0]
         axes.set_title(title, fontsize=9)
         if name in probes:
             axes.imshow(shown(0.5 * probes[name]))

@@ -2,8 +2,8 @@
 
 `python experiments/sh_accuracy.py [--json FILE] [--figure FILE] [--quick]`
 
-The reference knows no harmonics: the environment is cut into a thousand directions, each is a directional light with exact shadow rays, and
-the pictures are added up. Matte bones of a formula, and of a CT with a photographed sky where `$JVR_DATA` has them.
+The reference knows no harmonics: the environment is cut into a thousand directions, each is a directional light with shadow rays of
+one-voxel steps, and the pictures are added up. Matte bones of a formula, and of a CT with a photographed sky where `$JVR_DATA` has them.
 
 Errors are root mean squares over all pixels, relative to that of the reference. Colour differences at lower order are measured against
 the same picture without that.

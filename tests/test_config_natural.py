@@ -306,7 +306,7 @@ def test_a_fit_of_the_light_starts_from_another_environment(sky):
     image = f"environment={{kind='image',path='{sky}'}}"
     found = job(["environment.coefficients"], image, "material={kind='lambert'}", start)
     assert same(found.scene.environment, jvr.EnvironmentLight.constant(order=2))
-    assert same(found.scene.material, jax.jit(lambda m: m.projected(2))(jvr.LambertBRDF(0.5)))
+    assert same(found.scene.material, jax.jit(lambda m: m.projected(3))(jvr.LambertBRDF(0.5)))
 
 
 def test_a_white_furnace_is_white():

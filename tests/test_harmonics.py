@@ -155,7 +155,7 @@ def test_the_cap_in_closed_form(cosine):
         z, weight = (1 + cosine) / 2 + (1 - cosine) / 2 * z, weight * (1 - cosine) / 2
         d = np.stack([np.sqrt(1 - z * z), 0 * z, z], axis=1)
         functions = np.asarray(jvr.sh.evaluate(8, d))[:, np.arange(9) * np.arange(1, 10)]
-        np.testing.assert_allclose(jnp.stack(cap(jnp.asarray(cosine), 8)), 2 * np.pi * weight @ functions, atol=1e-12)
+        np.testing.assert_allclose(jnp.stack(cap(jnp.asarray(1 - cosine), 8)), 2 * np.pi * weight @ functions, atol=1e-12)
 
 
 def test_a_window_keeps_constants_and_ends_ringing():

@@ -11,6 +11,7 @@ import pytest
 from scenes import OBLIQUE, compiled, linear_transfer, perspective, rotation, voxels
 
 import jvr
+from jvr.effects.diffusion import kernel_of, scatter
 from jvr.effects.natural_light import natural_light
 from jvr.effects.transfer_grid import TransferProjection, project_all
 from jvr.model.harmonics.projection import sphere_nodes
@@ -56,6 +57,15 @@ def test_radiance_of_a_disc_is_that_of_its_projection():
         )
         by_quadrature = jvr.sh.project(inside, 4, degree=800)
     np.testing.assert_allclose(disc.coefficients, by_quadrature, atol=5e-3)
+
+
+@pytest.mark.parametrize("degrees", [0.2665, 0.05, 0.01, 1e-4])
+def test_a_small_lamp_keeps_its_light(degrees):
+    """The sun and smaller: in float32 as in closed form, where all bands are those of a point of that solid angle."""
+    disc = jvr.EnvironmentLight.disc([0.3, -0.5, 0.8], degrees, order=4)
+    towards = np.array([[0.3, -0.5, 0.8]]) / math.sqrt(0.98)
+    solid_angle = 4 * math.pi * math.sin(math.radians(degrees) / 2) ** 2
+    np.testing.assert_allclose(disc.coefficients[:, 0], solid_angle * jvr.sh.evaluate(4, towards)[0], rtol=2e-4)
 
 
 def test_rotating_the_light_and_the_directions_is_the_same():
@@ -191,7 +201,7 @@ def test_above_an_opaque_half_space_is_a_hemisphere():
     from jvr.model.harmonics.projection import cap
 
     expected = np.zeros(16)
-    expected[np.arange(4) * np.arange(1, 5)] = jnp.stack(cap(jnp.asarray(0.0), 3))
+    expected[np.arange(4) * np.arange(1, 5)] = jnp.stack(cap(jnp.asarray(1.0), 3))
     np.testing.assert_allclose(c[0, 0], expected, atol=0.05)
     # Above it the whole sphere is asked, at the surface the half above.
     np.testing.assert_allclose(opened, [1.0, 0.5], atol=0.02)
@@ -269,8 +279,6 @@ def test_luma_and_colour_differences_are_the_same_colours():
 
 @pytest.mark.parametrize("dipole", ["marble", "skin1"])
 def test_the_scattering_pass_is_the_direct_sum(dipole):
-    from jvr.effects.diffusion import kernel_of, scatter
-
     dipole, shape = jvr.Dipole.preset(dipole), (4, 5, 3)
     volume = jvr.Volume(voxels((10, 13, 7)), OBLIQUE)
     rng = np.random.default_rng(0)
@@ -355,6 +363,85 @@ def test_a_transfer_that_takes_too_much_memory_is_refused():
 def test_parts_that_do_not_go_together_are_refused(parts):
     with pytest.raises(ValueError, match=r"set environment|set material|radiance transfer"):
         jvr.Scene(jvr.Volume(voxels()), linear_transfer(), **({"environment": light(), "material": jvr.LambertBRDF()} | parts))
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_a_light_of_low_order_casts_the_shadows_of_its_transfer(order):
+    """The exact product under a light and under the same with bands of zeros; so does what was computed beforehand."""
+    low = light(order)
+    padded = jvr.EnvironmentLight(jnp.pad(low.coefficients, ((0, 16 - (order + 1) ** 2), (0, 0))))
+    transfer = jvr.RadianceTransfer(3, 16, 1.0, exact=True)
+    one, other = (scene(transfer=transfer, environment=e) for e in (low, padded))
+    np.testing.assert_allclose(picture(one), picture(other), atol=1e-5)
+    np.testing.assert_allclose(picture(jvr.precompute(one)), picture(other), atol=1e-5)
+
+
+def test_what_was_computed_under_a_plain_light_serves_another():
+    plain, other = scene(environment=jvr.EnvironmentLight.constant()), scene()
+    relit = dataclasses.replace(jvr.precompute(plain), environment=other.environment)
+    np.testing.assert_allclose(picture(relit), picture(other), atol=1e-5)
+
+
+def test_a_medium_without_surface_bleeds():
+    """Rays ask for no gradient of a material that has no normal. White clouds lose nothing, so nothing is dark."""
+    cloud = jvr.PhaseBRDF(jvr.Isotropic())
+    lit = scene(cloud, jvr.RadianceTransfer(rays=8, bleeding=jvr.MaterialBleeding()), shape=(3, 3, 4))
+    colour = jax.tree.map(jnp.ones_like, lit.transfer.rgb)
+    lit = dataclasses.replace(lit, transfer=jvr.LinearTransfer(lit.transfer.positions, colour, lit.transfer.sigma_t))
+    uniform = dataclasses.replace(lit, environment=jvr.EnvironmentLight.constant(order=3))
+    coefficients, opened = transfer_at(uniform)
+    np.testing.assert_allclose(coefficients[:, :, 0], CONSTANT * opened[:, None] * np.ones(3), rtol=1e-4)
+
+
+def test_scattering_over_no_distance_leaves_everything_in_its_place():
+    """Voxels of a decimetre: all of the kernel underflows."""
+    volume = jvr.Volume(voxels((4, 4, 4)), np.diag([300.0, 300, 300, 1]))
+    found, opened = scatter(jvr.Dipole.preset("ketchup"), 0.5, volume, jnp.ones((4, 4, 4, 1, 1)), jnp.ones((4, 4, 4)))
+    assert np.all(np.isfinite(found))
+    np.testing.assert_array_equal(opened, 1.0)
+
+
+def test_a_neighbourhood_is_a_ball_in_the_world():
+    volume = jvr.Volume(voxels((60, 60, 12)), np.diag([1.0, 1, 5, 1]))
+    kernel = kernel_of(jvr.Dipole.preset("skin1"), 0.1, volume, volume.shape)[0]
+    i, j, k = (np.arange(n) - n // 2 for n in kernel.shape)
+    distance = np.sqrt(i[:, None, None] ** 2 + j[:, None] ** 2 + (5.0 * k) ** 2)
+    np.testing.assert_array_equal(np.asarray(kernel) > 0, distance <= 5.9)
+
+
+@pytest.mark.parametrize(
+    ("materials", "error"),
+    [
+        ((jvr.LambertBRDF().projected(0), jvr.PhongBRDF().projected(3)), ValueError),
+        ((jvr.PhongBRDF().projected(2), jvr.PhongBRDF().projected(3)), ValueError),
+        ((jvr.MaterialByValue([0.0, 1.0], [jvr.LambertBRDF()] * 2), jvr.LambertBRDF()), TypeError),
+    ],
+)
+def test_materials_that_have_no_place_beside_each_other(materials, error):
+    with pytest.raises(error, match=r"order|materials"):
+        jvr.MaterialByValue([0.0, 1.0], materials).projected(3)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"bleeding": jvr.TransferBleeding}, {"bleeding": "material"}, {"scattering": "skin1"}],
+)
+def test_parts_of_another_kind_are_refused(wrong):
+    with pytest.raises(TypeError, match=r"jvr\."):
+        jvr.RadianceTransfer(**wrong)
+
+
+def test_memory_counts_every_channel():
+    coloured = linear_transfer(coloured=True)
+    transfer = jvr.RadianceTransfer(3, 4, 1.0, memory=4 * 5 * 6 * 7 * 17)
+    picture(scene(transfer=transfer))
+    with pytest.raises(ValueError, match="raise memory"):
+        picture(dataclasses.replace(scene(transfer=transfer), transfer=coloured))
+
+
+def test_nothing_to_scatter_may_be_kept_unscattered():
+    lit = scene(transfer=jvr.RadianceTransfer(rays=16), shape=(7, 9, 8))
+    assert jvr.precompute(lit, keep_unscattered=True).radiance_transfer.is_final
 
 
 # --- gradients -------------------------------------------------------------------------------------------------------

@@ -28,16 +28,19 @@ def scatter(
     over the nodes `x_i` of the medium (`open > 0`) in a neighbourhood, with the dipole's diffuse reflectance `R_d` and its total `R`.
     The paper's equation (4) divides by the number of neighbours instead, which leaves the scale of the picture to the units of `R_d`.
 
-    **Arguments:** `radius`: of the neighbourhood, as a share of the volume's longest side. By FFT, so that the time hardly depends on it.
+    **Arguments:** `radius`: of the neighbourhood, as a share of the volume's longest side, and at most that share of the longest axis in
+    voxels along each (they may differ where voxels are longer than wide). By FFT, so that the time hardly depends on it.
     Differentiable in everything.
     """
     kernel = kernel_of(dipole, radius, volume, opened.shape)
     there = (opened > 0).astype(opened.dtype)
     spread = lambda field, k: _convolved(field * there, k)
     weight = jax.vmap(lambda k: spread(there, k))(kernel)
-    # What FFT leaves of zero is rounding; a node of the medium has at least itself.
-    safe = jnp.where(there > 0, weight, 1.0)
-    mean = lambda field, c: jnp.where(there > 0, spread(field, kernel[c]) / safe[c], 0.0)
+    # A node of the medium has at least itself, unless all of the kernel underflows: then it keeps what it has. Elsewhere, what FFT leaves
+    # of zero is rounding.
+    spreads = (there > 0) & (weight > 0)
+    safe = jnp.where(spreads, weight, 1.0)
+    mean = lambda field, c: jnp.where(spreads[c], spread(field, kernel[c]) / safe[c], field * there)
     total, channels = dipole.total, coefficients.shape[3]
 
     def band(values: Float[Array, "x y z channels"]) -> Float[Array, "x y z 3"]:
@@ -55,7 +58,8 @@ def kernel_of(dipole: Dipole, radius: float, volume: Volume, shape: tuple[int, .
     offsets = np.stack(np.meshgrid(*[np.arange(-r, r + 1) for r in reach], indexing="ij"), axis=-1)
     axes = volume.world_from_grid[:3, :3] * jnp.asarray(steps)
     length = lambda offset: jnp.linalg.norm(offset @ axes.T, axis=-1)
-    inside = length(jnp.asarray(offsets, axes.dtype)) <= radius * longest * jnp.max(volume.spacing)
+    side = jnp.max(volume.spacing * (np.asarray(volume.shape) - 1))
+    inside = length(jnp.asarray(offsets, axes.dtype)) <= radius * side
     fractions = np.stack(np.meshgrid(*[(np.arange(PLACES) + 0.5) / PLACES - 0.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     places = offsets[..., None, :] + fractions
     values = jnp.stack(dipole.reflectance(length(jnp.asarray(places, axes.dtype))))

@@ -176,7 +176,7 @@ def natural_light_of(scene: Scene) -> NaturalLight:
     environment = scene.environment
     assert environment is not None
     assert scene.material is not None
-    material: HarmonicMaterial = scene.material.projected(environment.order)
+    material: HarmonicMaterial = scene.material.projected(scene.material_order)
     exact = scene.radiance_transfer is not None and scene.radiance_transfer.exact
     order = material.order if exact else min(material.order, environment.order)
     return natural_light(material, environment.coefficients, clamped=environment.clamped, order=order, from_samples=exact)

@@ -17,6 +17,7 @@ from jvr.effects.shading import share_of
 from jvr.march.medium import Medium
 from jvr.march.segments import classify_at
 from jvr.march.steps import Point
+from jvr.model.dipole import Dipole
 from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer
 from jvr.model.harmonics.basis import basis, count
 from jvr.model.light import perpendicular
@@ -94,8 +95,9 @@ class RadianceTransfer(AbstractRadianceTransfer):
       white light behind it).
     - `scattering`: `jvr.Dipole(...)` or `None`: each node gets the mean of what its neighbours receive, weighted with the dipole's diffuse
       reflectance; `neighbourhood`: its radius, as a share of the volume's longest side.
-    - `exact`: the triple product of material, light and transfer, instead of the paper's two double products (which a mean of the light
-      over the part of the sphere that rays are sent into makes exact for light that is the same from everywhere).
+    - `exact`: the triple product of material, light and transfer, instead of the paper's two double products (with the mean of the
+      transfer over the part of the sphere that rays are sent into, so that they are exact where it is the same all over that part and the
+      light is the same from everywhere).
     - `chromaticity`: `None`, or the order to keep colour differences at, where rays carry colour; luminance keeps `order`.
     - `step`, `growth`: first step in voxels, and the ratio of a step to the one before; `termination`: a ray ends once its transmittance
       is at most this.
@@ -139,9 +141,15 @@ class RadianceTransfer(AbstractRadianceTransfer):
         surface: float | int = 0.1,
         memory: float | int = 2e9,
     ):
+        if not isinstance(bleeding, TransferBleeding | MaterialBleeding | None):
+            raise TypeError(f"bleeding must be jvr.TransferBleeding(), jvr.MaterialBleeding() or None, not {bleeding!r}")
+        if not isinstance(scattering, Dipole | None):
+            raise TypeError(f'scattering must be a jvr.Dipole, such as jvr.Dipole.preset("skin1"), or None, not {scattering!r}')
+        whole = lambda x: isinstance(x, int) and not isinstance(x, bool)
         wrong = {
-            "order must be a whole number from 0 to 10": not isinstance(order, int) or not 0 <= order <= 10,
-            "rays must be a whole number of at least 1": not isinstance(rays, int) or rays < 1,
+            "order must be a whole number from 0 to 10": not whole(order) or not 0 <= order <= 10,
+            "rays must be a whole number of at least 1": not whole(rays) or rays < 1,
+            "memory must be a positive number of bytes": not memory > 0,
             "resolution must be above 0 and at most 1 nodes for each voxel": not 0 < resolution <= 1,
             "neighbourhood must be above 0 and at most 1 of the longest side": not 0 < neighbourhood <= 1,
             "step must be above 0 and growth at least 1": not (step > 0 and growth >= 1),
@@ -197,17 +205,21 @@ class RadianceTransfer(AbstractRadianceTransfer):
         return self.projected is not None and (self.scattering is None or self.projected.scattered)
 
     def shape(self, volume: Volume) -> tuple[int, int, int]:
-        """Nodes along each axis. **Raises** `ValueError` where their coefficients would exceed `memory`."""
+        """Nodes along each axis."""
         x, y, z = (1 if n == 1 else max(2, math.ceil((n - 1) * self.resolution) + 1) for n in volume.shape)
-        channels = 1 if self.bleeding is None and self.scattering is None else 3
-        needed = 4 * x * y * z * (channels * count(self.order) + 1)
+        return x, y, z
+
+    def check_memory(self, volume: Volume, transfer: AbstractTransfer) -> None:
+        """**Raises** `ValueError` where the coefficients of all nodes would exceed `memory`."""
+        extinctions = len(jax.eval_shape(transfer.evaluate, volume.intercept, volume.intercept).sigma_t)
+        channels = extinctions if self.bleeding is None and self.scattering is None else 3
+        needed = volume.slope.dtype.itemsize * math.prod(self.shape(volume)) * (channels * count(self.order) + 1)
         if needed > self.memory:
             fits = self.resolution * (self.memory / needed) ** (1 / 3)
             raise ValueError(
                 f"radiance transfer would take {needed / 1e9:.2g} GB, more than memory={self.memory:.2g} bytes: "
                 f"a resolution of {fits:.2f} fits, or raise memory"
             )
-        return x, y, z
 
     def made_for(self, transfer: AbstractTransfer, material: AbstractMaterial | None) -> Float[Array, "numbers"]:
         """What a projection depends on apart from the volume, as numbers."""
@@ -373,7 +385,9 @@ def _colour(rgb: Triple, sample: Any, albedo: NaturalLight | None, w_o: Triple) 
         normal, magnitude = direction_and_length(tuple(-g for g in gradient))
         return albedo.reflect(s, magnitude, normal, w_o, ())
 
-    tinted, plain = jax.vmap(one)(sample.s, sample.gradient, w_o)
+    # A material without a normal asks for no gradient.
+    gradient = sample.gradient or (jnp.zeros_like(sample.s),) * 3
+    tinted, plain = jax.vmap(one)(sample.s, gradient, w_o)
     return tuple(c * a + b for c, a, b in zip(rgb, tinted, plain, strict=True))
 
 

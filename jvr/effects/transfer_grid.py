@@ -64,7 +64,7 @@ def transfer_visibility(scene: Scene, medium: Medium, inner: AbstractVisibility 
         projected = scattered(scene, projected)
     coefficients, light = projected.coefficients, environment.coefficients
     if transfer.exact:
-        arriving = _products(coefficients, light, material.projected(environment.order).order)
+        arriving = _products(coefficients, light, material.projected(scene.material_order).order)
     else:
         arriving = _shares(projected, coefficients, light)
     shape = coefficients.shape[:3]
@@ -99,6 +99,7 @@ class TransferProjection(eqx.Module):
     def of(cls, scene: Scene, medium: Medium) -> "TransferProjection":
         """`medium`: what the scene's rays of light pass."""
         transfer, albedo = transfer_of(scene), None
+        transfer.check_memory(scene.volume, scene.transfer)
         if isinstance(transfer.bleeding, MaterialBleeding):
             assert scene.material is not None
             everywhere = jnp.full((1, 3), math.sqrt(4 * math.pi), scene.volume.slope.dtype)

@@ -24,6 +24,8 @@ from jvr.rendering.settings import Settings
 
 # Changes whenever what is computed from the same inputs does: what was kept before is then of no use.
 VERSION = 1
+# Order that materials are kept at under an environment of a lower one.
+LEAST_ORDER = 3
 # Nodes in a program of their own, between two reports of progress.
 TOGETHER = 2048
 
@@ -50,7 +52,8 @@ def precompute(
     keep_unscattered: bool = False,
 ) -> Scene:
     """The scene with its material projected on harmonics and its radiance transfer computed, so that pictures from any camera and under
-    any environment do neither again.
+    any environment do neither again. The material is kept up to order 3, or that of the environment (with an exact product, of the
+    transfer) where it is higher: of an environment of a still higher order no more than that is seen.
 
     Both are constants from then on. After a change of the volume, the transfer function, the clipping box, or the settings of
     `radiance_transfer`, compute again from a scene that has not been through here; a new material asks for it only with
@@ -69,14 +72,15 @@ def precompute(
         folder.mkdir(parents=True, exist_ok=True)
     report = report or (lambda done: None)
     if not keep_material:
-        material = (scene.material, np.asarray(environment.order))
-        project = lambda inputs: inputs[0].projected(environment.order)
+        order = _material_order(scene)
+        material = (scene.material, np.asarray(order))
+        project = lambda inputs: inputs[0].projected(order)
         projected = _kept(folder, project, material, lambda: jax.jit(project)(material), "material", report)
         scene = dataclasses.replace(scene, material=projected)
     if scene.radiance_transfer is None or scene.radiance_transfer.is_frozen:
         return scene
     transfer = transfer_of(scene)
-    if keep_unscattered:
+    if keep_unscattered and transfer.scattering is not None:
         scene = eqx.tree_at(lambda s: s.radiance_transfer.scattering, scene, None)
     # The light plays no part, and the material where rays do not pick up its colour.
     plays = isinstance(transfer.bleeding, MaterialBleeding)
@@ -99,7 +103,7 @@ def as_precomputed(scene: Scene) -> Scene:
     """A scene of the same structure as `precompute` makes of it, at once and with zeros for what it computes: for `jvr.plan`."""
     if scene.environment is None:
         return scene
-    order = scene.environment.order
+    order = _material_order(scene)
 
     def shaped(scene: Scene) -> Any:
         assert scene.material is not None
@@ -113,6 +117,11 @@ def as_precomputed(scene: Scene) -> Scene:
     if zeros[1] is None:
         return scene
     return dataclasses.replace(scene, radiance_transfer=transfer_of(scene).with_projected(zeros[1]))
+
+
+def _material_order(scene: Scene) -> int:
+    """As `Scene.material_order`, but of use under other environments too."""
+    return max(scene.material_order, LEAST_ORDER)
 
 
 def _projection(scene: Scene) -> TransferProjection:
@@ -157,21 +166,22 @@ def _kept(
 ) -> Any:
     """`compute()`, from the folder where it holds a result of the same inputs, and kept there where it does not."""
     began = time.perf_counter()
-    found = None if folder is None else _found(folder, function, inputs)
+    path = None if folder is None else folder / f"{_digest(inputs)}.npz"
+    found = None if path is None else _found(path, function, inputs)
     result = jax.block_until_ready(compute()) if found is None else found
-    if folder is not None and found is None:
-        with replacing(folder / f"{_digest(inputs)}.npz") as temporary, temporary.open("wb") as file:
+    if path is not None and found is None:
+        with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, *[np.asarray(x) for x in jax.tree.leaves(result)])
     nbytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(result))
     report(Precomputed(part, time.perf_counter() - began, found is not None, nbytes))
     return result
 
 
-def _found(folder: Path, function: Callable[[Any], Any], inputs: Any) -> Any:
-    """What the folder holds of `function(inputs)`, or `None`."""
+def _found(path: Path, function: Callable[[Any], Any], inputs: Any) -> Any:
+    """What the file holds of `function(inputs)`, or `None`."""
     leaves, structure = jax.tree.flatten(jax.eval_shape(function, inputs))
     try:
-        with np.load(folder / f"{_digest(inputs)}.npz", allow_pickle=False) as file:
+        with np.load(path, allow_pickle=False) as file:
             arrays = [file[f"arr_{i}"] for i in range(len(leaves))]
         if all(a.shape == x.shape and a.dtype == x.dtype for a, x in zip(arrays, leaves, strict=True)):
             return jax.tree.unflatten(structure, [jnp.asarray(a) for a in arrays])

@@ -52,7 +52,7 @@ class AbstractGlossyBRDF(AbstractBRDF):
     specular: Float[Array, "..."]
     exponent: Scalar
 
-    def __init__(self, diffuse: ArrayLike = 0.7, specular: ArrayLike = 0.3, exponent: ArrayLike = 30.0):
+    def __init__(self, diffuse: ArrayLike, specular: ArrayLike, exponent: ArrayLike):
         self.diffuse, self.specular = share(diffuse, "diffuse", (), (3,)), share(specular, "specular", (), (3,))
         self.exponent = float_array(exponent, "exponent", ())
         require(
@@ -76,6 +76,10 @@ class PhongBRDF(AbstractGlossyBRDF):
     the surface is lost. Arguments as `AbstractGlossyBRDF`.
     """
 
+    # Type checkers do not see an inherited constructor of a dataclass.
+    def __init__(self, diffuse: ArrayLike = 0.7, specular: ArrayLike = 0.3, exponent: ArrayLike = 30.0):
+        super().__init__(diffuse, specular, exponent)
+
     def lobe(self, w_o: Triple, w_i: Triple) -> Float[Array, "..."]:
         mirrored = (-w_i[0], -w_i[1], w_i[2])
         return (self.exponent + 2.0) / (2.0 * math.pi) * power_of_cosine(mirrored, w_o, self.exponent)
@@ -88,6 +92,9 @@ class BlinnPhongBRDF(AbstractGlossyBRDF):
     The factor makes the share reflected straight up exactly `specular` (Giesen 2009, Phong and Blinn-Phong normalization factors); the
     common `(e + 8) / (8 pi)` reflects up to 8 % more than arrives. Exponent 0 is Lambert's. Arguments as `AbstractGlossyBRDF`.
     """
+
+    def __init__(self, diffuse: ArrayLike = 0.7, specular: ArrayLike = 0.3, exponent: ArrayLike = 30.0):
+        super().__init__(diffuse, specular, exponent)
 
     def lobe(self, w_o: Triple, w_i: Triple) -> Float[Array, "..."]:
         half, _ = direction_and_length(tuple(o + i for o, i in zip(w_o, w_i, strict=True)))

@@ -79,6 +79,8 @@ class AbstractRadianceTransfer(eqx.Module):
 
     # Whether samples bring the light that reaches them, and not a share of all of it.
     exact: eqx.AbstractVar[bool]
+    # Highest order of its harmonics.
+    order: eqx.AbstractVar[int]
 
     @property
     @abc.abstractmethod

@@ -80,7 +80,7 @@ class EnvironmentLight(eqx.Module):
         axis = float_array(towards, "towards", (3,))
         require(jnp.linalg.norm(axis), lambda n: np.isfinite(n) & (n > 0), "towards must be a direction, not zero")
         rgb = jnp.broadcast_to(float_array(radiance, "radiance", (), (3,)), (3,))
-        kernel = jnp.stack(cap(jnp.cos(jnp.deg2rad(angle)), order))
+        kernel = jnp.stack(cap(2 * jnp.square(jnp.sin(jnp.deg2rad(angle) / 2)), order))
         about = harmonics.evaluate(order, normalise(axis)[None])[0]
         return cls(harmonics.convolve(about, kernel)[:, None] * rgb)
 

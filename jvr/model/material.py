@@ -127,7 +127,8 @@ class MaterialByValue(AbstractMaterial):
     """A material for each class of the transfer function: that of `positions[i]` is `materials[i]`, linear in between.
 
     **Arguments:** `positions`: `(n,)`, strictly increasing, in the data's units; `materials`: `n` BRDFs or `jvr.HarmonicMaterial`s of one
-    order and number of directions; the threshold is that of the first. **Raises** `ValueError` for other numbers of them.
+    order and number of directions; the threshold is that of the first. **Raises** `ValueError` for other numbers of them, and in
+    `projected` for orders or directions that differ; `TypeError` for anything else, such as another `MaterialByValue`.
     """
 
     positions: Float[Array, "n"]
@@ -137,8 +138,11 @@ class MaterialByValue(AbstractMaterial):
         self.positions = float_array(positions, "positions", (len(materials),))
         require(jnp.diff(self.positions), lambda d: d > 0, "positions must be strictly increasing: sort them")
         self.materials = tuple(materials)
-        if not self.materials or not all(isinstance(m, AbstractMaterial) for m in self.materials):
-            raise TypeError("materials must be BRDFs or jvr.HarmonicMaterial, one for each position")
+        single = [
+            isinstance(m, AbstractBRDF) or (isinstance(m, HarmonicMaterial) and m.positions.size == 1) for m in self.materials
+        ]
+        if not self.materials or not all(single):
+            raise TypeError("materials must be BRDFs or jvr.HarmonicMaterials of one class, one for each position")
 
     @property
     def needs_gradient(self) -> bool:
@@ -190,6 +194,8 @@ def _side_by_side(lobes: Sequence[Lobe | None]) -> Lobe | None:
         return None
     if len({lobe.about for lobe in there}) > 1:
         there = [lobe.in_plane() for lobe in there]
+    if len({lobe.coefficients.shape[2] for lobe in there}) > 1 or len({lobe.coefficients.shape[1] for lobe in there} - {1}) > 1:
+        raise ValueError("materials side by side need one order and number of directions: project them alike")
     shape = np.broadcast_shapes(*[lobe.coefficients.shape for lobe in there])
     found: Any = iter(there)
     rows = [jnp.zeros(shape) if lobe is None else jnp.broadcast_to(next(found).coefficients, shape) for lobe in lobes]

@@ -88,6 +88,19 @@ class Scene(eqx.Module):
         _check_light(self)
         _check_environment(self)
 
+    @property
+    def material_order(self) -> int:
+        """`material_order` of its environment and radiance transfer; 0 without an environment."""
+        return 0 if self.environment is None else material_order(self.environment, self.radiance_transfer)
+
+
+def material_order(environment: EnvironmentLight, transfer: AbstractRadianceTransfer | None) -> int:
+    """Order of the harmonics that a material is projected on: that of the environment; with an exact product the transfer's where that is
+    higher, since shadows are sharper than the light that casts them."""
+    if transfer is None or not transfer.exact:
+        return environment.order
+    return max(environment.order, transfer.order)
+
 
 def _check_light(scene: Scene) -> None:
     """Parts of the light that go together, each of its kind."""

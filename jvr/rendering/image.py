@@ -61,6 +61,9 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
     Traceable; `jax.jit(jvr.render)` compiles once for each structure of the scene, size of the picture and settings. A camera
     with non-finite numbers gives NaN pixels. **Raises** `ValueError` where `settings.sampling` does not support the scene.
     """
+    if scene.radiance_transfer is not None and not is_traced(scene):
+        for problem in scene.radiance_transfer.outdated(scene.transfer, scene.material):
+            warnings.warn(problem, RuntimeWarning, stacklevel=2)
     return settings.sampling.render(scene, camera, settings)
 
 
@@ -72,9 +75,6 @@ def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> 
         march = _render_pixels if pixels.size <= settings.tile else _render_tiles
         rgb, alpha, depth, steps = march(scene, camera, settings, where, pixels)
     else:
-        if scene.radiance_transfer is not None:
-            for problem in scene.radiance_transfer.outdated(scene.transfer, scene.material):
-                warnings.warn(problem, RuntimeWarning, stacklevel=3)
         where = _compiled_seen(scene, settings)
         part = functools.partial(_compiled_pixels, scene, camera, settings, where)
         rgb, alpha, depth, steps = in_parts(part, camera.height, camera.width, settings.tile)

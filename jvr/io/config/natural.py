@@ -22,7 +22,7 @@ from jvr.io.config.schema.natural import (
 )
 from jvr.model.effects import AbstractMaterial
 from jvr.model.environment import EnvironmentLight
-from jvr.model.scene import Scene
+from jvr.model.scene import Scene, material_order
 
 Prepare = Callable[..., Scene]
 
@@ -30,16 +30,17 @@ Prepare = Callable[..., Scene]
 def natural_parts(config: Config) -> dict[str, Any]:
     """What a configuration says about light from all around, as keywords of `jvr.Scene`."""
     tables, parts = config.tables, {}
+    if tables.radiance_transfer is not None:
+        with blame(config.where("radiance_transfer"), "radiance_transfer"):
+            parts["radiance_transfer"] = _radiance_transfer(config, tables.radiance_transfer)
     if tables.environment:
         several = len(tables.environment) > 1
         keys = [f"environment[{i}]" if several else "environment" for i in range(len(tables.environment))]
         lights = [_environment(config, key, table) for key, table in zip(keys, tables.environment, strict=True)]
         parts["environment"] = sum(lights[1:], lights[0])
         if tables.material is not None:
-            parts["material"] = _material(config, tables.material, parts["environment"].order)
-    if tables.radiance_transfer is not None:
-        with blame(config.where("radiance_transfer"), "radiance_transfer"):
-            parts["radiance_transfer"] = _radiance_transfer(config, tables.radiance_transfer)
+            order = material_order(parts["environment"], parts.get("radiance_transfer"))
+            parts["material"] = _material(config, tables.material, order)
     return parts
 
 

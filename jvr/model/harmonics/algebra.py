@@ -82,7 +82,7 @@ def two_double_products(material: ArrayLike, light: ArrayLike, transfer: ArrayLi
     """The paper's shortcut for the integral of material, light and transfer: `(material . light) (transfer . light)` (Lindemann and
     Ropinski 2010, section 4.3), divided by the integral of the light, so that a transfer of one leaves the light as it is.
 
-    Exact where the light is the same from everywhere, or the transfer is. Zero without light.
+    Exact where the transfer is the same from everywhere. Zero without light.
     """
     material, light, transfer = as_floats(material), as_floats(light), as_floats(transfer)
     total = light[0] * np.sqrt(4 * np.pi)

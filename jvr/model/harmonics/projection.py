@@ -98,7 +98,7 @@ def map_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 def project_map(pixels: Float[Array, "height width channels"], order: int) -> Float[Array, "bands channels"]:
     """Coefficients of a latitude-longitude map, each pixel constant over its solid angle and seen at its middle."""
-    pixels = jnp.asarray(pixels)
+    pixels = as_floats(pixels)
     height, width, channels = pixels.shape
     directions, solid_angle = map_directions(height, width)
     pad = -height % ROWS
@@ -125,14 +125,20 @@ def zonal(fn: Callable[[Float[Array, "n"]], Float[Array, "n *rest"]], order: int
     return jnp.tensordot(scaled, fn(jnp.asarray(z, bands.dtype)), axes=(0, 0))
 
 
-def cap(cosine: Float[Array, "..."], order: int) -> list[Array]:
-    """`zonal` of the indicator of the cap `z >= cosine`, in closed form, of any shape: with Legendre's polynomials
-    `k_l = 2 pi sqrt((2 l + 1) / (4 pi)) (P_{l-1} - P_{l+1}) / (2 l + 1)` at the cosine, and `P_{-1} = 1`."""
-    legendre = [jnp.ones_like(cosine), cosine]
-    for n in range(1, order + 1):
-        legendre.append(((2 * n + 1) * cosine * legendre[n] - n * legendre[n - 1]) / (n + 1))
-    before = [jnp.ones_like(cosine), *legendre]
-    return [math.sqrt(math.pi / (2 * n + 1)) * (before[n] - legendre[n + 1]) for n in range(order + 1)]
+def cap(gap: Float[Array, "..."], order: int) -> list[Array]:
+    """`zonal` of the indicator of the cap `1 - z <= gap` about the pole, in closed form, of any shape: with Legendre's polynomials
+    `k_l = 2 pi sqrt((2 l + 1) / (4 pi)) (1 - z^2) P_l'(z) / (l (l + 1))` at its edge, and `2 pi gap / sqrt(4 pi)` for `l = 0`.
+
+    A small cap keeps its digits: of the half angle, `gap = 2 sin^2(angle / 2)`, nothing cancels.
+    """
+    z = 1 - gap
+    value, slope = [jnp.ones_like(z), z], [jnp.zeros_like(z), jnp.ones_like(z)]
+    for n in range(1, order):
+        value.append(((2 * n + 1) * z * value[n] - n * value[n - 1]) / (n + 1))
+        slope.append(slope[n - 1] + (2 * n + 1) * value[n])
+    edge = gap * (2 - gap)
+    shares = [gap, *(edge * slope[n] / (n * (n + 1)) for n in range(1, order + 1))]
+    return [math.sqrt(math.pi * (2 * n + 1)) * share for n, share in enumerate(shares)]
 
 
 def convolve(coefficients: ArrayLike, kernel: ArrayLike) -> Float[Array, "bands *rest"]:
