@@ -317,9 +317,13 @@ def all_finite(tree: Any) -> bool:
 
 def table(quick: bool = False, jit: Callable[..., Any] = jax.jit, report: Callable[[str, Case, Found], None] | None = None):
     """For each row the worst error of value and of gradient, and what is not finite."""
-    ways, result = compiled_ways(jit), []
+    ways, result, structure = compiled_ways(jit), [], None
     for name, cases in rows(quick).items():
-        found = []
+        found, before = [], structure
+        structure = jax.tree.structure(cases[0].scene)
+        if structure != before:
+            # Programs of other scenes are of no more use, and hundreds of them exhaust a process's memory mappings.
+            jax.clear_caches()
         for k, case in enumerate(cases):
             # Forward mode and vmap of other shadows' programs take longest to compile and say the least.
             found.append(measured(case, ways, modes=not quick or k == 0))
@@ -362,12 +366,10 @@ def main() -> None:
     arguments = parser.parse_args()
 
     def report(name: str, case: Case, found: Found) -> None:
-        print(
-            f"  {name} | {case.label}: {found.value:.1e} {found.gradient:.1e} {found.worst} {' '.join(found.infinite)}",
-            flush=True,
-        )
+        line = f"  {name} | {case.label}: {found.value:.1e} {found.gradient:.1e} {found.worst} {' '.join(found.infinite)}"
+        print(line if arguments.verbose else f"  {name} ...", file=sys.stderr, flush=True)
 
-    result = table(arguments.quick, report=report if arguments.verbose else None)
+    result = table(arguments.quick, report=report)
     width = max(len(r["case"]) for r in result)
     print(f"{'case':<{width}}  {'value':>8}  {'gradient':>8}  not finite")
     for r in result:

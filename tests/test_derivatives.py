@@ -123,7 +123,8 @@ def test_optical_models(optical, x64):
     check_every_way(p, names, rows=(), optical=optical)
 
 
-@pytest.mark.parametrize(("kind", "parts"), [("linear", 1), pytest.param("table, coloured", 2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("kind", "parts"), [("linear", 1), ("table, coloured", 2)])
+@pytest.mark.slow
 def test_pre_integrated_segments(kind, parts, x64):
     check_every_way(parameters(TRANSFERS[kind]()), ("transfer", "voxels", "eye"), rows=(), quadrature=jvr.PreIntegrated(parts))
 

@@ -203,6 +203,10 @@ def test_priors_pull_where_images_are_silent():
 def test_dssim_needs_a_solver_that_uses_gradients():
     with pytest.raises(ValueError, match="BFGS"):
         fit(loss=jvr.DSSIM())
+
+
+@pytest.mark.slow
+def test_dssim_falls():
     result = fit(loss=jvr.DSSIM(), solver=optx.OptaxMinimiser(optax.adam(0.2), rtol=0.0, atol=0.0), max_steps=12)
     assert result.history[-1].loss < 0.5 * result.history[0].loss
 

@@ -37,6 +37,7 @@ def fit(start, cameras, images, unknowns, **keywords):
     return jvr.fit(start, cameras, images, unknowns=unknowns, settings=SETTINGS, progress=False, **keywords)
 
 
+@pytest.mark.slow
 def test_asymmetry_albedo_and_direction(volume):
     """Within three of its own standard errors, all of them; the length of a direction is none of the unknowns."""
     cameras, images = views(scene(volume), noise=1e-3)
@@ -75,6 +76,7 @@ def test_transfer_function_together_with_the_phase(volume):
     assert float(result.scene.scattering.phase.g) == pytest.approx(0.5, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_surfaces_without_shadows_have_rows(volume):
     """Entries of the table by rows, shading by forward mode: both are the derivatives of the same residuals."""
     lit = scene(volume, scattering=None, shadows=None, shading=jvr.Lambert(0.0, 0.7))

@@ -365,7 +365,7 @@ def test_parts_that_do_not_go_together_are_refused(parts):
         jvr.Scene(jvr.Volume(voxels()), linear_transfer(), **({"environment": light(), "material": jvr.LambertBRDF()} | parts))
 
 
-@pytest.mark.parametrize("order", [0, 1])
+@pytest.mark.parametrize("order", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_light_of_low_order_casts_the_shadows_of_its_transfer(order):
     """The exact product under a light and under the same with bands of zeros; so does what was computed beforehand."""
     low = light(order)

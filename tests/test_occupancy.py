@@ -174,6 +174,7 @@ def test_what_is_negligible_stays_below_its_bound(negligible, x64):
     assert saved > 0
 
 
+@pytest.mark.slow
 def test_fit_leaves_out_what_is_negligible(x64):
     """Rows of the table leap as gradients do: both give the same normal equations, and the fit still finds its target."""
     scene, camera = faint_scene(np.random.default_rng(0))

@@ -313,7 +313,7 @@ def along_each(p, moves, shadows, h=1e-6):
 
 
 @pytest.mark.parametrize(
-    "method", ["rays", *(pytest.param(m, marks=pytest.mark.slow) for m in ("none", "volume", "opacity map", "deep map"))]
+    "method", ["none", *(pytest.param(m, marks=pytest.mark.slow) for m in ("rays", "volume", "opacity map", "deep map"))]
 )
 def test_replay_against_central_differences(method, x64):
     """Along a random direction in each kind of array: transfer function, voxels, lights, pose, camera, phase function, albedo."""
