@@ -365,6 +365,15 @@ def test_parts_that_do_not_go_together_are_refused(parts):
         jvr.Scene(jvr.Volume(voxels()), linear_transfer(), **({"environment": light(), "material": jvr.LambertBRDF()} | parts))
 
 
+def test_rays_inside_of_an_opaque_medium_do_not_turn_with_roundings():
+    """There the transparency is below the precision, and a gradient of it would have any direction."""
+    lit = dataclasses.replace(scene(transfer=jvr.RadianceTransfer(rays=8, resolution=1.0)), transfer=linear_transfer(scale=1e2))
+    single = transfer_at(lit)[0]
+    with jax.enable_x64(True):
+        double = transfer_at(jax.tree.map(lambda x: x.astype(float), lit))[0]
+    np.testing.assert_allclose(single, double, atol=1e-4)
+
+
 @pytest.mark.parametrize("order", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_light_of_low_order_casts_the_shadows_of_its_transfer(order):
     """The exact product under a light and under the same with bands of zeros; so does what was computed beforehand."""

@@ -30,6 +30,8 @@ Numbers: TypeAlias = Float[Array, "..."]
 
 # Nodes that are projected together in one program.
 CHUNK = 256
+# A change of transparency that is a smaller share of `RadianceTransfer.surface` is none: it moves the cone's rim by less than 1e-6.
+FLAT = 1e-3
 # Azimuth between one direction and the next, the golden angle.
 GOLDEN = math.pi * (3 - math.sqrt(5))
 
@@ -302,8 +304,9 @@ def _cone(transfer: RadianceTransfer, volume: Volume, medium: Medium, p: Triple)
     inverse = volume.axes_inverse
     gradient = tuple(sum((inverse[j, i] * differences[j] for j in range(3)), jnp.zeros_like(p[0])) for i in range(3))
     axis, length = direction_and_length(gradient)
-    flat = length == 0
-    axis = (axis[0], axis[1], jnp.where(flat, 1.0, axis[2]))
+    # Without a surface the axis only turns the spiral; inside of an opaque medium a gradient would be made of roundings.
+    flat = length * width <= FLAT * transfer.surface
+    axis = tuple(jnp.where(flat, fixed, c) for fixed, c in zip((0.0, 0.0, 1.0), axis, strict=True))
     strength = opacity(p) * share_of(length * width, jnp.asarray(transfer.surface, length.dtype))
     return Cone(axis, jnp.sin(0.5 * math.pi * (1 - strength)))
 

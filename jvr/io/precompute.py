@@ -23,7 +23,7 @@ from jvr.rendering.medium import absorbing, occupancy
 from jvr.rendering.settings import Settings
 
 # Changes whenever what is computed from the same inputs does: what was kept before is then of no use.
-VERSION = 1
+VERSION = 2
 # Order that materials are kept at under an environment of a lower one.
 LEAST_ORDER = 3
 # Nodes in a program of their own, between two reports of progress.
