@@ -19,8 +19,8 @@ from benchmarks import scenes, yardsticks
 from benchmarks.light import light
 from benchmarks.timing import median, ratio, seconds
 from jvr.march.march import MarchOptions, march
-from jvr.rendering.image import enter, step_length
 from jvr.rendering.medium import medium
+from jvr.rendering.trace import enter, step_length
 
 SIZE = 256
 

@@ -321,7 +321,7 @@ def table(quick: bool = False, jit: Callable[..., Any] = jax.jit, report: Callab
     for name, cases in rows(quick).items():
         found, before = [], structure
         structure = jax.tree.structure(cases[0].scene)
-        if structure != before:
+        if before is not None and structure != before:
             # Programs of other scenes are of no more use, and hundreds of them exhaust a process's memory mappings.
             jax.clear_caches()
         for k, case in enumerate(cases):

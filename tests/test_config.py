@@ -20,7 +20,7 @@ from jvr.io.config import (
     read_transfer,
     write_transfer,
 )
-from jvr.rendering.image import enter
+from jvr.rendering.trace import enter
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 BASE = '[volume]\nbuiltin = "demo"\n[transfer]\nkind = "window"\n'

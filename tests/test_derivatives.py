@@ -8,7 +8,7 @@ import pytest
 from scenes import OBLIQUE, compiled, gaussian_transfer, linear_transfer, lut_transfer, perspective, voxels
 
 import jvr
-from jvr.rendering.image import trace
+from jvr.rendering.trace import trace
 
 WIDTH, HEIGHT = 5, 4
 

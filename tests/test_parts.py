@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import lut_transfer, perspective, render, voxels
+from scenes import compiled, lut_transfer, perspective, render, voxels
 
 import jvr
 from jvr import parallel
@@ -48,21 +48,77 @@ def test_arrays_that_a_traced_function_closes_over_are_part_of_it():
     assert "while[" in str(traced)
 
 
+@pytest.mark.parametrize(("height", "width"), [(13, 10), (4, 8), (1, 7), (3, 2), (1, 1)])
+def test_blocks_hold_every_pixel_once(height, width):
+    order = parts.pixels_of(parts.all_blocks(height, width), height, width)
+    index = jnp.arange(height * width).reshape(height, width)
+    np.testing.assert_array_equal(parts.picture_of(order, height, width), index)
+    # What lies beyond the border is no pixel: each number comes back once.
+    np.testing.assert_array_equal(jnp.zeros(height * width).at[order].add(parts.rays_of(jnp.ones_like(index), height, width)), 1)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_a_picture_is_dealt_out_and_joined(count):
+    picture = jnp.arange(13 * 10 * 2.0).reshape(13, 10, 2)
+    pieces = parts.dealt(13, 10, count, picture)
+    assert len({piece.shape for piece in pieces}) == 1
+    np.testing.assert_array_equal(parts.joined(13, 10, pieces), picture)
+
+
 def test_out_of_memory_halves_the_parts_with_one_warning(small_parts):
     sizes = []
 
-    def function(pixels):
+    def function(blocks):
+        pixels = parts.pixels_of(blocks, 13, 10)
         sizes.append(pixels.size)
         if pixels.size > 20:
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 bytes.")
         return 2 * pixels
 
     with pytest.warns(RuntimeWarning, match="out of memory") as warned:
-        found = parts.in_parts(function, 13, 10, 10**6)
-    np.testing.assert_array_equal(found, 2 * np.arange(130))
+        found = parts.joined(13, 10, parts.in_parts(function, 13, 10, 10**6))
+    np.testing.assert_array_equal(found, 2 * np.arange(130).reshape(13, 10))
     assert len(warned) == 1
-    assert max(sizes) == 50
-    assert sizes[-1] == 20
+    assert max(sizes) == 48
+    assert sizes[-1] == 16
+
+
+@pytest.mark.parametrize("what", ["rgb", "alpha", "depth", "everything"])
+def test_a_derivative_in_parts_is_that_of_one_program(small_parts, x64, what):
+    """Of pictures that parts do not divide, in everything that is an array."""
+    scene = scene_of(1, np.float64)
+    camera = perspective(scene.volume, 15, 13)
+    weight = jnp.asarray(np.random.default_rng(2).normal(size=(13, 15, 5)))
+
+    def loss(arrays, rest):
+        picture = jvr.render(*eqx.combine(arrays, rest), jvr.Settings(0.7))
+        shown = {"rgb": picture.rgb, "alpha": picture.alpha[..., None], "depth": picture.depth[..., None]}
+        seen = jnp.concatenate(list(shown.values()), axis=-1) if what == "everything" else shown[what]
+        return jnp.sum(weight[..., : seen.shape[-1]] * jnp.sin(seen)), picture.rgb
+
+    arrays, rest = eqx.partition((scene, camera), eqx.is_inexact_array)
+    of = jax.value_and_grad(loss, has_aux=True)
+    ours, whole = of(arrays, rest), compiled(of)(arrays, rest)
+    # Each gradient is a sum over rays in another order.
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-11 * float(jnp.max(jnp.abs(b))))
+    jax.tree.map(close, ours, whole)
+
+
+def test_derivatives_in_parts_under_vmap_and_over_again(small_parts):
+    """Of several scenes at a time, and of several weighted sums of one picture at a time."""
+    scene = scene_of(1)
+    camera = perspective(scene.volume, 8, 5)
+
+    def picture(sigma_t):
+        changed = eqx.tree_at(lambda s: s.transfer.sigma_t, scene, sigma_t)
+        return jvr.render(changed, camera, jvr.Settings(0.7)).rgb
+
+    loss, sigma_t = lambda sigma_t: jnp.sum(picture(sigma_t) ** 2), scene.transfer.sigma_t
+    both = jnp.stack([sigma_t, 2 * sigma_t])
+    apart = jnp.stack([jax.grad(loss)(x) for x in both])
+    np.testing.assert_allclose(jax.vmap(jax.grad(loss))(both), apart, rtol=1e-4, atol=1e-6)
+    jacobian = jax.jacrev(lambda x: picture(x)[2, 3])(sigma_t)
+    np.testing.assert_allclose(jacobian, compiled(jax.jacrev(lambda x: picture(x)[2, 3]))(sigma_t), rtol=1e-4, atol=1e-7)
 
 
 def test_what_does_not_fit_at_all_and_other_failures_are_raised(small_parts):

@@ -23,9 +23,10 @@ from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
-from jvr.rendering.image import Seen, composite, step_length, trace
 from jvr.rendering.medium import needs_gradient
+from jvr.rendering.parts import all_blocks, picture_of, pixels_of
 from jvr.rendering.settings import Settings
+from jvr.rendering.trace import Seen, composite, step_length, trace
 from jvr.types import Scalar, Triple
 
 
@@ -110,10 +111,10 @@ def image_value(
     settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
     losses, where = [], seen_in_fit(model.scene, settings)
     for camera, target in zip(cameras, images, strict=True):
-        pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
-        gathered, rays, _ = trace(model.scene, camera, settings, pixels, where=where)
-        rendered = jnp.stack(predict(problem, model, gathered, rays.length), axis=-1).reshape(target.shape)
-        losses.append(problem.loss.image(rendered, target))
+        size = (camera.height, camera.width)
+        gathered, rays, _ = trace(model.scene, camera, settings, pixels_of(all_blocks(*size), *size), where=where)
+        rendered = jnp.stack(predict(problem, model, gathered, rays.length), axis=-1)
+        losses.append(problem.loss.image(picture_of(rendered, *size), target))
     return jnp.mean(jnp.stack(losses)) + prior(problem, model)
 
 

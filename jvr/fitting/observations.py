@@ -15,10 +15,10 @@ from jvr.march.quadrature import Midpoint
 from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.rendering.image import Seen, enter, step_length
 from jvr.rendering.medium import medium, natural, occupancy, visibility
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
+from jvr.rendering.trace import Seen, enter, step_length
 from jvr.types import Triple
 
 

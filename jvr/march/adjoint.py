@@ -38,13 +38,18 @@ def replay_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) 
 
 
 def _replay_forward(options: MarchOptions, *arguments: Any):
+    wanted, fixed = wanted_and_fixed(arguments)
+    gathered, noted = integrate(options, *eqx.combine(wanted, fixed), for_replay=True)
+    return gathered, (wanted, fixed, noted)
+
+
+def wanted_and_fixed(arguments: Any) -> tuple[Any, Any]:
+    """The arguments of a `custom_vjp` rule with symbolic zeros in two halves, each leaf in one of them: a `None` in the first asks for no
+    derivative."""
     is_primal = lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
     inputs = jax.tree.map(lambda x: x.value, arguments, is_leaf=is_primal)
     perturbed = jax.tree.map(lambda x: x.perturbed and eqx.is_inexact_array(x.value), arguments, is_leaf=is_primal)
-    gathered, noted = integrate(options, *inputs, for_replay=True)
-    # What is perturbed is known by which half of the inputs a leaf is in: a None in `wanted` asks for no derivative.
-    wanted, fixed = eqx.partition(inputs, perturbed)
-    return gathered, (wanted, fixed, noted)
+    return eqx.partition(inputs, perturbed)
 
 
 def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
@@ -58,6 +63,24 @@ def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
 
 
 replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def resumed_march(options: MarchOptions, done: tuple[Marched, Noted], medium: Medium, rays: Rays, dt: Scalar) -> Marched:
+    """`replay_march` where `integrate` has been through the same medium before: only the replay is left to do."""
+    return done[0]
+
+
+def _resumed_forward(options: MarchOptions, done: Any, *arguments: Any):
+    gathered, noted = jax.tree.map(lambda x: x.value, done, is_leaf=lambda x: hasattr(x, "perturbed"))
+    return gathered, (*wanted_and_fixed(arguments), noted)
+
+
+def _resumed_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
+    return None, *_replay_backward(options, residuals, cotangent)
+
+
+resumed_march.defvjp(_resumed_forward, _resumed_backward, symbolic_zeros=True)
 
 Inputs = tuple[Medium, Rays, Scalar]
 

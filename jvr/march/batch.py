@@ -13,7 +13,7 @@ Shared = TypeVar("Shared")
 Results = TypeVar("Results")
 
 # Lanes in the pool: enough to outweigh what it costs to start an operation, few enough for their state to stay in the cache.
-POOL = 6144
+POOL = 3072
 # The share of lanes that may idle before they are filled again.
 IDLE = 0.25
 # Neighbouring rays that are put in order together.

@@ -20,11 +20,12 @@ from jvr.model.scene import Scene
 from jvr.model.transfer import LinearTransfer, LutTransfer
 from jvr.model.volume import Trilinear
 from jvr.numerics import divide_or_zero
-from jvr.rendering.image import Rendering, RenderStats, composite, enter, one_precision, step_length
+from jvr.rendering.image import Rendering, RenderStats
 from jvr.rendering.medium import is_lit
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Slices, SliceStats
 from jvr.rendering.settings import Settings
+from jvr.rendering.trace import composite, enter, one_precision, step_length
 from jvr.types import Channels, Scalar
 
 # Bricks across which the oracle is asked to look: a picture whose pixels are larger than that is coarser than the volume anyway.

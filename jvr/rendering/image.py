@@ -1,26 +1,25 @@
 """`jvr.render`: a scene seen by a camera."""
 
 import functools
+import math
 import warnings
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.march import Marched, MarchOptions
-from jvr.march.medium import AbstractVisibility
-from jvr.march.occupancy import Occupancy
-from jvr.march.steps import Rays
+from jvr.march.differentiation import Replay
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
-from jvr.rendering.medium import medium, natural, occupancy, visibility
-from jvr.rendering.parts import in_parts, is_traced
+from jvr.rendering.medium import prepares_light
+from jvr.rendering.parts import all_blocks, block_shape, in_parts, is_traced, joined, picture_of, pixels_of
+from jvr.rendering.reverse import reversible
 from jvr.rendering.sampling import RefinementStats, SliceStats
 from jvr.rendering.settings import Settings
-from jvr.types import Image, Scalar, Triple
+from jvr.rendering.trace import Pixels, Seen, develop, seen, trace
+from jvr.types import Image
 
 
 class RenderStats(eqx.Module):
@@ -69,123 +68,43 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
 
 def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> Rendering:
     """`render` with every ray and every visible sample."""
-    if is_traced((scene, camera)):
-        pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
-        where = seen(scene, settings)
-        march = _render_pixels if pixels.size <= settings.tile else _render_tiles
-        rgb, alpha, depth, steps = march(scene, camera, settings, where, pixels)
-    else:
+    height, width = camera.height, camera.width
+    at_hand = not is_traced((scene, camera))
+    if not (at_hand or is_traced(())) and isinstance(settings.adjoint, Replay) and not prepares_light(scene):
+        # A derivative of arrays at hand.
+        made: Any = reversible(settings, scene, camera)
+        (rgb, alpha, depth), steps = made
+        return Rendering(rgb, alpha, depth, RenderStats(steps))
+    if at_hand:
         where = _compiled_seen(scene, settings)
         part = functools.partial(_compiled_pixels, scene, camera, settings, where)
-        rgb, alpha, depth, steps = in_parts(part, camera.height, camera.width, settings.tile)
-    shape = (camera.height, camera.width)
-    stats = RenderStats(steps.reshape(shape), shadows=where.shadow_stats)
-    return Rendering(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape), stats)
+        (rgb, alpha, depth), steps = joined(height, width, in_parts(part, height, width, settings.tile))
+    else:
+        where = seen(scene, settings)
+        rays = _in_tiles(scene, camera, settings, where, all_blocks(height, width))
+        (rgb, alpha, depth), steps = picture_of(rays, height, width)
+    return Rendering(rgb, alpha, depth, RenderStats(steps, shadows=where.shadow_stats))
 
 
-class Seen(NamedTuple):
-    """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under light from
-    all around; each `None` where the scene asks for none."""
-
-    occupancy: Occupancy | None = None
-    shadows: AbstractVisibility | None = None
-    natural: Any = None
-
-    @property
-    def shadow_stats(self) -> Any:
-        return None if self.shadows is None else self.shadows.stats
-
-
-def seen(scene: Scene, settings: Settings) -> Seen:
-    """What rays through a scene need to know beforehand."""
-    (scene,) = one_precision(scene)
-    where = occupancy(scene, settings)
-    return Seen(where, visibility(scene, where), natural(scene))
-
-
-def trace(
-    scene: Scene,
-    camera: AbstractCamera,
-    settings: Settings,
-    pixels: Int[Array, "rays"],
-    *,
-    where: Seen = Seen(),
-    distance: bool = False,
-) -> tuple[Marched, Rays, Float[Array, "rays"]]:
-    """Marches the rays of some pixels, only `where` there is something to see; returns what they gathered, the rays, and the distance
-    from the eye to their entry."""
-    scene, camera = one_precision(scene, camera)
-    rays, t_in = enter(scene, *camera.rays(pixels))
-    options = MarchOptions(settings.termination, distance)
-    return settings.adjoint.march(options, medium(scene, settings, *where), rays, step_length(scene, settings)), rays, t_in
-
-
-def one_precision(scene: Scene, *others: Any) -> Any:
-    """A scene and whatever else with every floating-point array in the widest precision among them, as the state of the loop needs; with
-    x64 on, parts of a scene may differ. Voxels stay as they are in memory."""
-    voxels = lambda tree: tree[0].volume.values
-    floats, rest = eqx.partition(eqx.tree_at(voxels, (scene, *others), None), eqx.is_inexact_array)
-    widest = jnp.result_type(*jax.tree.leaves(floats))
-    promoted = eqx.combine(jax.tree.map(lambda x: x.astype(widest), floats), rest)
-    return eqx.tree_at(voxels, promoted, scene.volume.values, is_leaf=lambda x: x is None)
-
-
-def step_length(scene: Scene, settings: Settings) -> Scalar:
-    """World length of a segment."""
-    return settings.step * jnp.min(scene.volume.spacing)
-
-
-def enter(scene: Scene, origin: Triple, direction: Triple) -> tuple[Rays, Float[Array, "rays"]]:
-    """World rays inside the volume (and its clipping box), and the distance from their origin to where they enter.
-
-    A ray with non-finite numbers gets the length NaN, which `composite` turns into a NaN pixel.
-    """
-    start = scene.volume.grid_from_world(origin)
-    along = scene.volume.grid_from_world(direction, direction=True)
-    t_in, t_out = ray_box(start, along, *scene.volume.domain)
-    if scene.clipping is not None:
-        near, far = ray_box(origin, direction, tuple(scene.clipping.lower), tuple(scene.clipping.upper))
-        t_in, t_out = jnp.maximum(t_in, near), jnp.minimum(t_out, far)
-    t_in = jnp.maximum(t_in, 0.0)
-    hit = t_out > t_in
-    # A ray that misses gets harmless numbers before any arithmetic, so that its derivative is zero and not 0 * inf.
-    t_in, t_out = jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0)
-    keep = lambda v: tuple(jnp.where(hit, x, 0.0) for x in v)
-    poison = jnp.where(jnp.isfinite(sum(start) + sum(along)), 0.0, jnp.nan)
-    start, along = keep(start), keep(along)
-    entry = tuple(s + t_in * d for s, d in zip(start, along, strict=True))
-    return Rays(entry, along, t_out - t_in + poison), t_in
-
-
-def composite(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> tuple[Triple, Float[Array, "rays"]]:
-    """Colour of each ray with the background behind the medium, and the medium's opacity."""
-    transmittances = tuple(jnp.exp(-tau) for tau in gathered.tau)
-    zero = jnp.where(jnp.isnan(length), jnp.nan, 0.0)
-    rgb = tuple(zero + L for L in gathered.radiance or (0.0, 0.0, 0.0))
-    if scene.background is not None:
-        clear = transmittances * (3 // len(transmittances)) if transmittances else (1.0, 1.0, 1.0)
-        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, scene.background, strict=True))
-    # Not 1 - T: thin media keep their digits.
-    alpha = sum((one_minus_exp(tau) for tau in gathered.tau), zero) / max(len(gathered.tau), 1)
-    return rgb, alpha
-
-
-def _render_pixels(scene: Scene, camera: AbstractCamera, settings: Settings, where: Seen, pixels: Int[Array, "rays"]):
+def _render_blocks(
+    scene: Scene, camera: AbstractCamera, settings: Settings, where: Seen, blocks: Int[Array, "blocks"]
+) -> tuple[Pixels, Int[Array, "rays"]]:
+    pixels = pixels_of(blocks, camera.height, camera.width)
     gathered, rays, t_in = trace(scene, camera, settings, pixels, where=where, distance=True)
-    rgb, alpha = composite(scene, gathered, rays.length)
-    weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
-    depth = jnp.where(alpha > 0, t_in + divide_or_zero(weighted, alpha), 0.0)
     assert gathered.steps is not None
-    return jnp.stack(rgb, axis=-1), alpha, depth, gathered.steps
+    return develop(scene, gathered, rays, t_in), gathered.steps
 
 
-def _render_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, where: Seen, pixels: Int[Array, "rays"]):
-    count = -(-pixels.size // settings.tile)
-    # The last tile repeats the last pixel; what it computes for it is dropped.
-    padded = jnp.minimum(jnp.arange(count * settings.tile, dtype=jnp.int32), pixels.size - 1).reshape(count, settings.tile)
-    tiles = jax.lax.map(lambda tile: _render_pixels(scene, camera, settings, where, tile), padded)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: pixels.size], tiles)
+def _in_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, where: Seen, blocks: Int[Array, "blocks"]):
+    """`_render_blocks`, at most `settings.tile` rays at a time."""
+    together = max(settings.tile // math.prod(block_shape(camera.height, camera.width)), 1)
+    if blocks.size <= together:
+        return _render_blocks(scene, camera, settings, where, blocks)
+    # The last tile repeats the last block; what it computes for it is dropped.
+    padded = jnp.pad(blocks, (0, -blocks.size % together), mode="edge").reshape(-1, together)
+    tiles = jax.lax.map(lambda tile: _render_blocks(scene, camera, settings, where, tile), padded)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tiles)
 
 
-_compiled_pixels = jax.jit(_render_pixels, static_argnums=2)
+_compiled_pixels = jax.jit(_render_blocks, static_argnums=2)
 _compiled_seen = jax.jit(seen, static_argnums=1)

@@ -87,6 +87,11 @@ def arriving_lights(scene: Scene) -> tuple[AbstractLight, ...]:
     return tuple(light for light in scene.lights if isinstance(light, AbstractLight))
 
 
+def prepares_light(scene: Scene) -> bool:
+    """Whether there is light that is prepared once for a picture, with derivatives of its own."""
+    return scene.shadows is not None or scene.radiance_transfer is not None or scene.material is not None
+
+
 def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility | None:
     """What says how much light reaches a point, or `None` where nothing is in its way. Made once for a picture."""
     if scene.shadows is None and scene.radiance_transfer is None:

@@ -17,11 +17,12 @@ from jvr.march.march import MarchOptions
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero
-from jvr.rendering.image import Rendering, RenderStats, Seen, composite, enter, one_precision, seen, step_length
+from jvr.rendering.image import Rendering, RenderStats
 from jvr.rendering.medium import medium
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Refinement, RefinementStats
 from jvr.rendering.settings import Settings
+from jvr.rendering.trace import Seen, composite, enter, one_precision, seen, step_length
 
 
 class _Grid(NamedTuple):

@@ -1,0 +1,137 @@
+"""The rays of a picture: from the camera into the volume, through it, and what they have gathered as colours."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jvr.march.march import Marched, MarchOptions
+from jvr.march.medium import AbstractVisibility, Medium
+from jvr.march.occupancy import Occupancy
+from jvr.march.steps import Rays
+from jvr.model.camera import AbstractCamera
+from jvr.model.scene import Scene
+from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
+from jvr.rendering.medium import medium, natural, occupancy, visibility
+from jvr.rendering.settings import Settings
+from jvr.types import Scalar, Triple
+
+
+class Seen(NamedTuple):
+    """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under light from
+    all around; each `None` where the scene asks for none."""
+
+    occupancy: Occupancy | None = None
+    shadows: AbstractVisibility | None = None
+    natural: Any = None
+
+    @property
+    def shadow_stats(self) -> Any:
+        return None if self.shadows is None else self.shadows.stats
+
+
+def seen(scene: Scene, settings: Settings) -> Seen:
+    """What rays through a scene need to know beforehand."""
+    (scene,) = one_precision(scene)
+    where = occupancy(scene, settings)
+    return Seen(where, visibility(scene, where), natural(scene))
+
+
+def trace(
+    scene: Scene,
+    camera: AbstractCamera,
+    settings: Settings,
+    pixels: Int[Array, "rays"],
+    *,
+    where: Seen = Seen(),
+    distance: bool = False,
+) -> tuple[Marched, Rays, Float[Array, "rays"]]:
+    """Marches the rays of some pixels, only `where` there is something to see; returns what they gathered, the rays, and the distance
+    from the eye to their entry."""
+    aimed, t_in = aim(scene, camera, settings, pixels, where)
+    return settings.adjoint.march(MarchOptions(settings.termination, distance), *aimed), aimed.rays, t_in
+
+
+class Aimed(NamedTuple):
+    """What a march takes: what rays go through, the rays, and the length of a segment."""
+
+    medium: Medium
+    rays: Rays
+    dt: Scalar
+
+
+def aim(
+    scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], where: Seen
+) -> tuple[Aimed, Float[Array, "rays"]]:
+    """The rays of some pixels before they are marched, and the distance from the eye to their entry."""
+    scene, camera = one_precision(scene, camera)
+    rays, t_in = enter(scene, *camera.rays(pixels))
+    return Aimed(medium(scene, settings, *where), rays, step_length(scene, settings)), t_in
+
+
+def one_precision(scene: Scene, *others: Any) -> Any:
+    """A scene and whatever else with every floating-point array in the widest precision among them, as the state of the loop needs; with
+    x64 on, parts of a scene may differ. Voxels stay as they are in memory."""
+    voxels = lambda tree: tree[0].volume.values
+    floats, rest = eqx.partition(eqx.tree_at(voxels, (scene, *others), None), eqx.is_inexact_array)
+    widest = jnp.result_type(*jax.tree.leaves(floats))
+    promoted = eqx.combine(jax.tree.map(lambda x: x.astype(widest), floats), rest)
+    return eqx.tree_at(voxels, promoted, scene.volume.values, is_leaf=lambda x: x is None)
+
+
+def step_length(scene: Scene, settings: Settings) -> Scalar:
+    """World length of a segment."""
+    return settings.step * jnp.min(scene.volume.spacing)
+
+
+def enter(scene: Scene, origin: Triple, direction: Triple) -> tuple[Rays, Float[Array, "rays"]]:
+    """World rays inside the volume (and its clipping box), and the distance from their origin to where they enter.
+
+    A ray with non-finite numbers gets the length NaN, which `composite` turns into a NaN pixel.
+    """
+    start = scene.volume.grid_from_world(origin)
+    along = scene.volume.grid_from_world(direction, direction=True)
+    t_in, t_out = ray_box(start, along, *scene.volume.domain)
+    if scene.clipping is not None:
+        near, far = ray_box(origin, direction, tuple(scene.clipping.lower), tuple(scene.clipping.upper))
+        t_in, t_out = jnp.maximum(t_in, near), jnp.minimum(t_out, far)
+    t_in = jnp.maximum(t_in, 0.0)
+    hit = t_out > t_in
+    # A ray that misses gets harmless numbers before any arithmetic, so that its derivative is zero and not 0 * inf.
+    t_in, t_out = jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0)
+    keep = lambda v: tuple(jnp.where(hit, x, 0.0) for x in v)
+    poison = jnp.where(jnp.isfinite(sum(start) + sum(along)), 0.0, jnp.nan)
+    start, along = keep(start), keep(along)
+    entry = tuple(s + t_in * d for s, d in zip(start, along, strict=True))
+    return Rays(entry, along, t_out - t_in + poison), t_in
+
+
+def composite(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> tuple[Triple, Float[Array, "rays"]]:
+    """Colour of each ray with the background behind the medium, and the medium's opacity."""
+    transmittances = tuple(jnp.exp(-tau) for tau in gathered.tau)
+    zero = jnp.where(jnp.isnan(length), jnp.nan, 0.0)
+    rgb = tuple(zero + L for L in gathered.radiance or (0.0, 0.0, 0.0))
+    if scene.background is not None:
+        clear = transmittances * (3 // len(transmittances)) if transmittances else (1.0, 1.0, 1.0)
+        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, scene.background, strict=True))
+    # Not 1 - T: thin media keep their digits.
+    alpha = sum((one_minus_exp(tau) for tau in gathered.tau), zero) / max(len(gathered.tau), 1)
+    return rgb, alpha
+
+
+class Pixels(NamedTuple):
+    """What a `jvr.Rendering` shows of each ray."""
+
+    rgb: Float[Array, "rays 3"]
+    alpha: Float[Array, "rays"]
+    depth: Float[Array, "rays"]
+
+
+def develop(scene: Scene, gathered: Marched, rays: Rays, t_in: Float[Array, "rays"]) -> Pixels:
+    """The pixels of rays that were marched with their distance."""
+    rgb, alpha = composite(scene, gathered, rays.length)
+    weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
+    depth = jnp.where(alpha > 0, t_in + divide_or_zero(weighted, alpha), 0.0)
+    return Pixels(jnp.stack(rgb, axis=-1), alpha, depth)
