@@ -11,26 +11,29 @@ from pathlib import Path
 import jax
 
 import jvr
+from benchmarks.accelerator import accelerator
 from benchmarks.cases import CASES
 from benchmarks.peers.run import peers, scattering
 
 
 def main() -> None:
-    """Runs the named measurements, all by default, and prints one JSON object. `scattering` is a part of `peers`, also to be had alone."""
+    """Runs the named measurements, all by default, and prints one JSON object. `scattering` is a part of `peers`, also to be had alone;
+    `accelerator` is among the default ones where there is one."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    beside = {"peers": peers, "scattering": scattering}
+    beside = {"peers": peers, "scattering": scattering, "accelerator": accelerator}
     names = [*CASES, *beside]
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)} (a part of peers); all by default")
     parser.add_argument("--json", metavar="FILE", help="also write the result to FILE")
     parser.add_argument(
-        "--quick", action="store_true", help="peers and scattering: small sizes and few rounds, to see that it runs"
+        "--quick", action="store_true", help="peers, scattering, accelerator: small sizes and few rounds, to see that it runs"
     )
     arguments = parser.parse_args()
     unknown = set(arguments.names) - set(names)
     if unknown:
         parser.error(f"unknown benchmark {', '.join(sorted(unknown))}: choose from {', '.join(names)}")
     result = {"machine": machine()}
-    for name in arguments.names or [*CASES, "peers"]:
+    default = [*CASES, "peers"] if jax.default_backend() == "cpu" else [*CASES, "peers", "accelerator"]
+    for name in arguments.names or default:
         print(f"{name} ...", file=sys.stderr, flush=True)
         result[name] = beside[name](arguments.quick) if name in beside else CASES[name]()
     text = json.dumps(result, indent=2)
