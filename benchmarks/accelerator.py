@@ -81,7 +81,7 @@ class HandWritten:
         return self.library.march_on_host(ctypes.byref(self.march), self.out.ctypes.data)
 
     def picture(self) -> np.ndarray:
-        return np.asarray(picture_of(self.out[:, :3], *self.size))
+        return np.asarray(picture_of(jnp.asarray(self.out[:, :3]), *self.size))
 
 
 def accelerator(quick: bool = False) -> dict[str, Any]:
