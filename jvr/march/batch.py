@@ -14,6 +14,8 @@ Results = TypeVar("Results")
 
 # Lanes in the pool: enough to outweigh what it costs to start an operation, few enough for their state to stay in the cache.
 POOL = 3072
+# How many times as many lanes an accelerator keeps in flight: as many as a large one has threads. (Chosen, not measured.)
+WIDER = 64
 # The share of lanes that may idle before they are filled again.
 IDLE = 0.25
 # Neighbouring rays that are put in order together.
@@ -31,7 +33,7 @@ def pooled_while(
     shared: Shared,
     work: Int[Array, "rays"],
 ) -> tuple[Results, Shared]:
-    """`while any(alive): advance` for every ray, of which at most `POOL` are in flight.
+    """`while any(alive): advance` for every ray, of which at most `POOL` are in flight (more on accelerators).
 
     `inputs` and what `finish` returns are pytrees of arrays with a leading axis of rays; `start` makes the state of a batch from its
     inputs; `shared` is carried along. `advance` must leave a finished lane as it is. Rays with more `work` to do start first, so
@@ -40,14 +42,15 @@ def pooled_while(
 
     Finished rays are thus not paid for, and memory in flight does not grow with the picture.
     """
-    if work.shape[0] <= POOL:
+    pool, tail = (n if jax.default_backend() == "cpu" else WIDER * n for n in (POOL, TAIL))
+    if work.shape[0] <= pool:
         state, shared = jax.lax.while_loop(
             lambda carry: jnp.any(alive(inputs, carry[0])), lambda carry: advance(inputs, *carry), (start(inputs), shared)
         )
         return finish(state), shared
     queue, size = _longest_first(work)
     take = lambda index: jax.tree.map(lambda x: x[index], inputs)
-    index = queue[:POOL]
+    index = queue[:pool]
     own = take(index)
     state = start(own)
     results = jax.tree.map(lambda x: jnp.zeros((work.shape[0], *x.shape[1:]), x.dtype), jax.eval_shape(finish, state))
@@ -55,11 +58,11 @@ def pooled_while(
 
     def filling(carry):
         own, state, _, _, following, _ = carry
-        return (following < size) | (jnp.sum(alive(own, state)) > TAIL)
+        return (following < size) | (jnp.sum(alive(own, state)) > tail)
 
     def drain_and_fill(carry):
         own, state, shared, index, following, results = carry
-        enough = jnp.where(following < size, int(POOL * (1 - IDLE)), TAIL)
+        enough = jnp.where(following < size, int(pool * (1 - IDLE)), tail)
         state, shared = jax.lax.while_loop(
             lambda c: jnp.sum(alive(own, c[0])) > enough, lambda c: advance(own, *c), (state, shared)
         )
@@ -73,12 +76,12 @@ def pooled_while(
         following = jnp.minimum(following + jnp.sum(idle, dtype=jnp.int32), size)
         return own, state, shared, index, following, results
 
-    carry = (own, state, shared, index, jnp.int32(POOL), results)
+    carry = (own, state, shared, index, jnp.int32(pool), results)
     own, state, shared, index, _, results = jax.lax.while_loop(filling, drain_and_fill, carry)
     # Lanes that are not alive are done and written; one of them fills up the smaller pool, and is written again. Where all are alive,
     # in a pool no larger than the smaller one, none may be taken twice: what it adds to `shared` would count twice.
     living = alive(own, state)
-    lanes = jnp.nonzero(living, size=min(TAIL, POOL), fill_value=jnp.argmin(living))[0]
+    lanes = jnp.nonzero(living, size=min(tail, pool), fill_value=jnp.argmin(living))[0]
     index, state = index[lanes], jax.tree.map(lambda x: x[lanes], state)
     own = take(index)
     state, shared = jax.lax.while_loop(lambda c: jnp.any(alive(own, c[0])), lambda c: advance(own, *c), (state, shared))
