@@ -22,7 +22,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     beside = {"peers": peers, "scattering": scattering, "accelerator": accelerator}
     names = [*CASES, *beside]
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)} (a part of peers); all by default")
+    parser.add_argument(
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help=f"of {', '.join(names)} ; all by default, scattering as a part of peers, accelerator where there is one",
+    )
     parser.add_argument("--json", metavar="FILE", help="also write the result to FILE")
     parser.add_argument(
         "--quick", action="store_true", help="peers, scattering, accelerator: small sizes and few rounds, to see that it runs"

@@ -110,9 +110,8 @@ __global__ void every_ray(March m, float* out) {
     if (i < m.count) trace(m, i, out + 4 * size_t(i));
 }
 
-// The same on the device, from arrays of the host. Returns the milliseconds of the fastest of `repeats` launches, transfers left out, or
-// a CUDA error as a negative number.
-extern "C" float march_on_device(const March* host, float* out, int repeats) {
+// The same on the device, from arrays of the host; `milliseconds` of each of `repeats` launches, transfers left out. Returns CUDA's error.
+extern "C" int march_on_device(const March* host, float* out, float* milliseconds, int repeats) {
     March m = *host;
     const size_t voxels = sizeof(float) * m.n[0] * m.n[1] * m.n[2], pixels = sizeof(float) * 4 * size_t(m.count);
     const size_t bricks = size_t(m.bricks[0]) * m.bricks[1] * m.bricks[2];
@@ -138,22 +137,20 @@ extern "C" float march_on_device(const March* host, float* out, int repeats) {
     cudaEvent_t begin, end;
     cudaEventCreate(&begin);
     cudaEventCreate(&end);
-    float best = 1e30f;
     // The first launch warms up.
-    for (int launch = 0; launch <= repeats && !error; launch++) {
+    for (int launch = -1; launch < repeats && !error; launch++) {
         cudaEventRecord(begin);
         every_ray<<<(m.count + 127) / 128, 128>>>(m, pixels_there);
+        error = cudaGetLastError();
         cudaEventRecord(end);
-        error = cudaEventSynchronize(end);
-        float milliseconds = 0;
-        if (!error) error = cudaEventElapsedTime(&milliseconds, begin, end);
-        if (launch > 0) best = at_most(best, milliseconds);
+        if (!error) error = cudaEventSynchronize(end);
+        if (!error && launch >= 0) error = cudaEventElapsedTime(milliseconds + launch, begin, end);
     }
     if (!error) error = cudaMemcpy(out, pixels_there, pixels, cudaMemcpyDeviceToHost);
     for (auto& copy : copies) cudaFree(copy.to);
     cudaFree(pixels_there);
     cudaEventDestroy(begin);
     cudaEventDestroy(end);
-    return error ? -float(error) : best;
+    return error;
 }
 #endif

@@ -21,7 +21,7 @@ def version() -> str:
 
 
 class Renderer:
-    """One scene in `jvr`; voxels, transfer function and camera are arguments of the compiled program."""
+    """One scene in `jvr`; voxels, transfer function and camera are arguments of the compiled programs."""
 
     def __init__(self, scene: scenes.Scene):
         self.scene, self.camera = _scene(scene), _camera(scene.view)
@@ -33,7 +33,7 @@ class Renderer:
         settings = jvr.Settings(step, termination=TERMINATION)
         self._image = lambda scene, camera: jvr.render(scene, camera, settings).rgb
         loss = lambda entries, scene, camera: _loss(entries, scene, camera, settings)
-        # Not compiled as a whole, so that the picture and the walk back use both cores.
+        # Not compiled as a whole, so that the picture and the walk back use all cores.
         self._gradient = jax.value_and_grad(loss, has_aux=True)
 
     def draw(self) -> None:

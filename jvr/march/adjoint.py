@@ -25,6 +25,7 @@ from jaxtyping import Array, Float, Int
 from jvr.march.batch import pooled_while
 from jvr.march.march import Marched, MarchOptions, Noted, integrate, march
 from jvr.march.medium import Medium, for_derivatives
+from jvr.march.rules import is_zero, values, wanted_and_fixed, with_zeros
 from jvr.march.segments import Lanes, Stretch, lanes_of, lit, places, resample, shown
 from jvr.march.steps import Rays, Sample, points_at, segment
 from jvr.march.sums import opacity, through, transmittance
@@ -43,23 +44,12 @@ def _replay_forward(options: MarchOptions, *arguments: Any):
     return gathered, (wanted, fixed, noted)
 
 
-def wanted_and_fixed(arguments: Any) -> tuple[Any, Any]:
-    """The arguments of a `custom_vjp` rule with symbolic zeros in two halves, each leaf in one of them: a `None` in the first asks for no
-    derivative."""
-    is_primal = lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
-    inputs = jax.tree.map(lambda x: x.value, arguments, is_leaf=is_primal)
-    perturbed = jax.tree.map(lambda x: x.perturbed and eqx.is_inexact_array(x.value), arguments, is_leaf=is_primal)
-    return eqx.partition(inputs, perturbed)
-
-
 def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
-    is_zero = lambda x: isinstance(x, jax.custom_derivatives.SymbolicZero)
     if all(map(is_zero, cotangent.distance)):
         # Nobody asks for the derivative of the distance: it is then not replayed either.
         cotangent = cotangent._replace(distance=())
-    cotangent = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_zero(x) else x, cotangent, is_leaf=is_zero)
     wanted, fixed, noted = residuals
-    return replay(wanted, fixed, noted, cotangent._replace(steps=None))
+    return replay(wanted, fixed, noted, with_zeros(cotangent)._replace(steps=None))
 
 
 replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
@@ -72,7 +62,7 @@ def resumed_march(options: MarchOptions, done: tuple[Marched, Noted], medium: Me
 
 
 def _resumed_forward(options: MarchOptions, done: Any, *arguments: Any):
-    gathered, noted = jax.tree.map(lambda x: x.value, done, is_leaf=lambda x: hasattr(x, "perturbed"))
+    gathered, noted = values(done)
     return gathered, (*wanted_and_fixed(arguments), noted)
 
 

@@ -12,6 +12,7 @@ from jvr.march.adjoint import Inputs, is_there, replay_march
 from jvr.march.march import Marched, MarchOptions, march
 from jvr.march.medium import Medium, for_derivatives
 from jvr.march.rows import TableRows, table_rows
+from jvr.march.rules import is_zero
 from jvr.march.steps import Rays
 from jvr.model.transfer import AbstractTable, AbstractTransfer
 from jvr.types import Scalar
@@ -61,7 +62,6 @@ def _rows_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -
 
 
 def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[Marched, Marched]:
-    is_zero = lambda t: isinstance(t, jax.custom_derivatives.SymbolicZero)
     perturbed = jax.tree.map(lambda t, x: not is_zero(t) and eqx.is_inexact_array(x), tangents, primals, is_leaf=is_zero)
     tangents = eqx.filter(tangents, perturbed)
     medium, rays, dt = primals

@@ -24,6 +24,7 @@ from jvr.march.adjoint import is_there
 from jvr.march.compact import accumulate, for_each
 from jvr.march.fields import VoxelField
 from jvr.march.march import Marched
+from jvr.march.rules import values, wanted_and_fixed, with_zeros
 from jvr.march.slices import (
     End,
     Gathered,
@@ -61,21 +62,15 @@ def _marched(end: End) -> tuple[Marched, Int[Array, "pixels"], Int[Array, "level
 
 
 def _replay_forward(options: SliceOptions, slices: Any):
-    is_primal = lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
-    inputs = jax.tree.map(lambda x: x.value, slices, is_leaf=is_primal)
-    perturbed = jax.tree.map(lambda x: x.perturbed and eqx.is_inexact_array(x.value), slices, is_leaf=is_primal)
+    inputs, (wanted, fixed) = values(slices), wanted_and_fixed(slices)
     end = march_slices(options, inputs)
-    # What is perturbed is known by which half of the inputs a leaf is in: a None in `wanted` asks for no derivative.
-    wanted, fixed = eqx.partition(inputs, perturbed)
     return _marched(end), (wanted._replace(distances=None), fixed, inputs.distances, end)
 
 
 def _replay_backward(options: SliceOptions, residuals: Any, cotangents: Any):
-    is_zero = lambda x: isinstance(x, jax.custom_derivatives.SymbolicZero)
-    cotangent: Marched = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_zero(x) else x, cotangents[0], is_leaf=is_zero)
     wanted, fixed, distances, end = residuals
     slices = eqx.combine(wanted._replace(distances=distances), fixed)
-    return (replay(options, slices, wanted, end, cotangent),)
+    return (replay(options, slices, wanted, end, with_zeros(cotangents[0])),)
 
 
 replay_slices.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)

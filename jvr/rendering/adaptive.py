@@ -19,13 +19,12 @@ from jvr.model.preintegration import PreIntegratedTable
 from jvr.model.scene import Scene
 from jvr.model.transfer import LinearTransfer, LutTransfer
 from jvr.model.volume import Trilinear
-from jvr.numerics import divide_or_zero
 from jvr.rendering.image import Rendering, RenderStats
 from jvr.rendering.medium import is_lit
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Slices, SliceStats
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import composite, enter, one_precision, step_length
+from jvr.rendering.trace import develop, enter, one_precision, step_length
 from jvr.types import Channels, Scalar
 
 # Bricks across which the oracle is asked to look: a picture whose pixels are larger than that is coarser than the volume anyway.
@@ -71,15 +70,11 @@ def render_slices(
     marched: Any = replay_slices(options, Sliced(scene.volume, shading, lattice, dt, distances))
     gathered, ended, samples = marched
 
-    rgb, alpha = composite(scene, gathered, finest.length)
-    weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
-    depth = jnp.where(alpha > 0, t_in + divide_or_zero(weighted, alpha), 0.0)
-    crop = lambda x: x.reshape(options.shape(0))[1 : camera.height + 1, 1 : camera.width + 1]
-    rgb, alpha, depth, steps = jax.tree.map(crop, (rgb, alpha, depth, gathered.steps))
+    crop = lambda x: x.reshape(*options.shape(0), *x.shape[1:])[1 : camera.height + 1, 1 : camera.width + 1]
+    pixels, steps = jax.tree.map(crop, (develop(scene, gathered, finest, t_in), gathered.steps))
     full = jnp.where(lattice.last >= 0, jnp.minimum(ended, lattice.last) - lattice.first + 1, 0)
-    return Rendering(
-        jnp.stack(rgb, axis=-1), alpha, depth, RenderStats(steps, SliceStats(samples, jnp.sum(full, dtype=jnp.int32)))
-    )
+    stats = RenderStats(steps, SliceStats(samples, jnp.sum(full, dtype=jnp.int32)))
+    return Rendering(pixels.rgb, pixels.alpha, pixels.depth, stats)
 
 
 def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:

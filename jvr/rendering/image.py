@@ -18,7 +18,7 @@ from jvr.rendering.parts import all_blocks, block_shape, in_parts, is_traced, jo
 from jvr.rendering.reverse import reversible
 from jvr.rendering.sampling import RefinementStats, SliceStats
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Pixels, Seen, develop, seen, trace
+from jvr.rendering.trace import Pixels, Seen, compiled_seen, develop, seen, trace
 from jvr.types import Image
 
 
@@ -69,14 +69,14 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
 def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> Rendering:
     """`render` with every ray and every visible sample."""
     height, width = camera.height, camera.width
-    at_hand = not is_traced((scene, camera))
-    if not (at_hand or is_traced(())) and isinstance(settings.adjoint, Replay) and not prepares_light(scene):
-        # A derivative of arrays at hand.
+    compiling, at_hand = is_traced(()), not is_traced((scene, camera))
+    if not compiling and not at_hand and isinstance(settings.adjoint, Replay) and not prepares_light(scene):
+        # Inside of `jax.grad` or `jax.vmap`, and of no program.
         made: Any = reversible(settings, scene, camera)
         (rgb, alpha, depth), steps = made
         return Rendering(rgb, alpha, depth, RenderStats(steps))
     if at_hand:
-        where = _compiled_seen(scene, settings)
+        where = compiled_seen(scene, settings)
         part = functools.partial(_compiled_pixels, scene, camera, settings, where)
         (rgb, alpha, depth), steps = joined(height, width, in_parts(part, height, width, settings.tile))
     else:
@@ -107,4 +107,3 @@ def _in_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, where: S
 
 
 _compiled_pixels = jax.jit(_render_blocks, static_argnums=2)
-_compiled_seen = jax.jit(seen, static_argnums=1)

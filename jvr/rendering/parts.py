@@ -81,9 +81,20 @@ def rays_of(picture: Any, height: int, width: int) -> Any:
     return jax.tree.map(one, picture)
 
 
+def dealt_blocks(height: int, width: int, most: int) -> list[np.ndarray]:
+    """The blocks of a picture in parts of at most `most`, dealt out in turn, so that all parts have about as much to do.
+
+    Part `p` of `n` has the blocks `p, p + n, ...`. All have the same number: where they do not come out even the last block is repeated.
+    """
+    count = math.prod(blocks_of(height, width))
+    parts = -(-count // most)
+    blocks = np.arange(parts)[:, None] + parts * np.arange(-(-count // parts))
+    return list(np.minimum(blocks, count - 1).astype(np.int32))
+
+
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def joined(height: int, width: int, pieces: Sequence[Any]) -> Any:
-    """The picture that `in_parts` made."""
+    """The picture that pieces with an entry for each ray make, one for each part of `dealt_blocks`."""
     size = math.prod(block_shape(height, width))
 
     def one(*arrays: Array) -> Array:
@@ -108,21 +119,16 @@ def dealt(height: int, width: int, parts: int, picture: Any) -> list[Any]:
 
 
 def in_parts(function: Callable[[Int[Array, "blocks"]], Any], height: int, width: int, tile: int) -> list[Any]:
-    """`function` of all blocks of a picture, dealt out in turn, so that all parts have about as much to do.
+    """`function` of all blocks of a picture, in parts of at most `tile` rays: a result for each part, which `joined` puts together.
 
-    A part has at most `tile` rays, or one block; where one does not fit into memory, parts are halved, with one warning. All parts have
-    the same number of blocks: the last one is repeated where they do not come out even. Part `p` of `n` has the blocks `p, p + n, ...`.
+    Where a part does not fit into memory, parts are halved, with one warning.
     """
     count, size = math.prod(blocks_of(height, width)), math.prod(block_shape(height, width))
-    rays = min(tile, max(LEAST, -(-height * width // workers())))
-    most = min(max(rays // size, 1), count)
+    most = min(max(tile // size, 1), max(LEAST // size, -(-count // workers())))
     warned = False
     while True:
         try:
-            parts = -(-count // most)
-            blocks = np.arange(parts)[:, None] + parts * np.arange(-(-count // parts))
-            blocks = np.minimum(blocks, count - 1).astype(np.int32)
-            return in_threads(lambda part: function(jnp.asarray(part)), list(blocks))
+            return in_threads(lambda part: function(jnp.asarray(part)), dealt_blocks(height, width, most))
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error) or most == 1:
                 raise

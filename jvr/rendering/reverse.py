@@ -6,6 +6,7 @@ walk back.
 """
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,14 +14,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from jvr.march.adjoint import resumed_march, wanted_and_fixed
+from jvr.march.adjoint import resumed_march
 from jvr.march.march import Marched, MarchOptions, Noted, integrate
+from jvr.march.rules import is_zero, wanted_and_fixed
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.parallel import in_threads, workers
-from jvr.rendering.parts import all_blocks, dealt, in_parts, is_traced, joined, pixels_of
+from jvr.rendering.parts import block_shape, dealt, dealt_blocks, in_parts, is_traced, joined, pixels_of
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Pixels, Seen, aim, develop, seen
+from jvr.rendering.trace import Pixels, Seen, aim, compiled_seen, develop
 
 
 class _Done(NamedTuple):
@@ -35,38 +37,40 @@ class _Done(NamedTuple):
 def reversible(settings: Settings, scene: Scene, camera: AbstractCamera) -> tuple[Pixels, Int[Array, "height width"]]:
     """The pixels of a picture and the samples taken for each, differentiable in reverse mode as by `jvr.Replay()`. Where
     light is prepared for the whole picture (`prepares_light`) its derivative would be missing."""
-    return _forward(settings, scene, camera)[0]
+    return _picture(settings, scene, camera, for_replay=False)[0]
 
 
-def _forward(settings: Settings, scene: Scene, camera: AbstractCamera):
+def _picture(settings: Settings, scene: Scene, camera: AbstractCamera, *, for_replay: bool):
     height, width = camera.height, camera.width
-    where = _compiled_seen(scene, settings)
-    part = functools.partial(_march, scene, camera, settings, where)
-    # Inside of `vmap`, arrays belong to this thread.
-    traced = is_traced((scene, camera))
-    pieces = [part(all_blocks(height, width))] if traced else in_parts(part, height, width, settings.tile)
+    where = compiled_seen(scene, settings)
+    part = functools.partial(_march, scene, camera, settings, for_replay, where)
+    if is_traced((scene, camera)):
+        # Inside of `vmap`, whose arrays belong to this thread.
+        most = max(settings.tile // math.prod(block_shape(height, width)), 1)
+        pieces = [part(jnp.asarray(blocks)) for blocks in dealt_blocks(height, width, most)]
+    else:
+        pieces = in_parts(part, height, width, settings.tile)
     return joined(height, width, [made for made, _ in pieces]), (where, [done for _, done in pieces])
 
 
 def _forward_rule(settings: Settings, scene: Any, camera: Any):
     wanted, fixed = wanted_and_fixed((scene, camera))
-    picture, left = _forward(settings, *eqx.combine(wanted, fixed))
+    picture, left = _picture(settings, *eqx.combine(wanted, fixed), for_replay=True)
     return picture, (wanted, fixed, *left)
 
 
 def _backward_rule(settings: Settings, residuals: Any, cotangent: tuple[Pixels, Any]) -> Any:
     wanted, fixed, where, done = residuals
     camera = eqx.combine(wanted, fixed)[1]
-    is_zero = lambda x: isinstance(x, jax.custom_derivatives.SymbolicZero)
     pixels = tuple(None if is_zero(x) else x for x in cotangent[0])
     shares = dealt(camera.height, camera.width, len(done), pixels)
     one = lambda k: _replay(settings, wanted, fixed, where, done[k], shares[k])
-    parts, total = range(len(done)), None
-    if is_traced((wanted, cotangent)):
-        return one(0) if len(parts) == 1 else functools.reduce(_added, map(one, parts))
+    if is_traced((residuals, pixels)):
+        return functools.reduce(_added, map(one, range(len(done))))
+    total = None
     # A few at a time: each may be as large as the volume.
-    for begin in range(0, len(parts), workers()):
-        found = in_threads(one, parts[begin : begin + workers()])
+    for begin in range(0, len(done), workers()):
+        found = in_threads(one, range(len(done))[begin : begin + workers()])
         total = functools.reduce(_added, found if total is None else [total, *found])
     return total
 
@@ -74,13 +78,13 @@ def _backward_rule(settings: Settings, residuals: Any, cotangent: tuple[Pixels, 
 reversible.defvjp(_forward_rule, _backward_rule, symbolic_zeros=True)
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _march(scene: Scene, camera: AbstractCamera, settings: Settings, where: Seen, blocks: Int[Array, "blocks"]):
-    """Some blocks of the picture, the samples taken for each pixel, and what a replay needs."""
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def _march(scene: Scene, camera: AbstractCamera, settings: Settings, for_replay: bool, where: Seen, blocks: Int[Array, "blocks"]):
+    """Some blocks of the picture, the samples taken for each pixel, and `for_replay` what that needs."""
     aimed, t_in = aim(scene, camera, settings, pixels_of(blocks, camera.height, camera.width), where)
-    gathered, noted = integrate(MarchOptions(settings.termination, True), *aimed, for_replay=True)
-    assert noted is not None
-    return (develop(scene, gathered, aimed.rays, t_in), gathered.steps), _Done(blocks, gathered, noted)
+    gathered, noted = integrate(MarchOptions(settings.termination, True), *aimed, for_replay=for_replay)
+    done = None if noted is None else _Done(blocks, gathered, noted)
+    return (develop(scene, gathered, aimed.rays, t_in), gathered.steps), done
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -97,5 +101,4 @@ def _replay(settings: Settings, wanted: Any, fixed: Any, where: Seen, done: _Don
     return jax.vjp(again, wanted)[1](cotangent)[0]
 
 
-_compiled_seen = jax.jit(seen, static_argnums=1)
 _added = jax.jit(lambda a, b: jax.tree.map(jnp.add, a, b))
