@@ -83,7 +83,7 @@ def test_out_of_memory_halves_the_parts_with_one_warning(small_parts):
     assert sizes[-1] == 16
 
 
-@pytest.mark.parametrize("what", ["rgb", "alpha", "depth", "everything"])
+@pytest.mark.parametrize("what", ["everything", *(pytest.param(x, marks=pytest.mark.slow) for x in ("rgb", "alpha", "depth"))])
 def test_a_derivative_in_parts_is_that_of_one_program(small_parts, x64, what):
     """Of pictures that parts do not divide, in everything that is an array."""
     scene = scene_of(1, np.float64)
@@ -125,7 +125,10 @@ def kinds_of_scenes():
     }
 
 
-@pytest.mark.parametrize("kind", ["lit", "by gradient", "pre-integrated, in tiles", "negligible"])
+SLOW_KINDS = (pytest.param(kind, marks=pytest.mark.slow) for kind in ("pre-integrated, in tiles", "negligible"))
+
+
+@pytest.mark.parametrize("kind", ["lit", "by gradient", *SLOW_KINDS])
 def test_every_kind_of_scene_has_its_derivative_in_parts(small_parts, x64, kind):
     scene, settings = kinds_of_scenes()[kind]
     # (Rays of no symmetry: a sample on the face of a voxel has one gradient or the other, by a rounding.)
