@@ -5,14 +5,50 @@ busy. Programs that do not wait for each other are therefore run from threads; t
 """
 
 import concurrent.futures
+import functools
 import os
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
+from jax.core import Tracer
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+def is_traced(tree: Any) -> bool:
+    """Whether any array of `tree` is being traced, or whatever is computed now."""
+    return any(isinstance(x, Tracer) for x in (jax.numpy.zeros(()), *jax.tree.leaves(tree)))
+
+
+def program(function: Callable[..., Result], static_argnums: int | tuple[int, ...] = ()) -> Callable[..., Result]:
+    """`jax.jit` of a function that is a program of its own where its arguments are at hand, and a part of another one elsewhere.
+
+    On processors it then works with vectors as wide as they have, where the compiler's own choice is half of that.
+    """
+    inside, own = jax.jit(function, static_argnums=static_argnums), None
+
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Result:
+        nonlocal own
+        if jax.default_backend() != "cpu" or is_traced(arguments):
+            return inside(*arguments)
+        own = own or jax.jit(function, static_argnums=static_argnums, compiler_options=_widest())
+        return own(*arguments)
+
+    return call
+
+
+@functools.cache
+def _widest() -> dict[str, Any]:
+    """The compiler's option, where it knows it."""
+    options = {"xla_cpu_prefer_vector_width": 512}
+    try:
+        jax.jit(lambda x: x, compiler_options=options).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return options
 
 
 def workers() -> int:

@@ -13,8 +13,9 @@ from jaxtyping import Array, Float, Int
 from jvr.march.differentiation import Replay
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
+from jvr.parallel import is_traced, program
 from jvr.rendering.medium import prepares_light
-from jvr.rendering.parts import all_blocks, block_shape, in_parts, is_traced, joined, picture_of, pixels_of
+from jvr.rendering.parts import all_blocks, block_shape, in_parts, joined, picture_of, pixels_of
 from jvr.rendering.reverse import reversible
 from jvr.rendering.sampling import RefinementStats, SliceStats
 from jvr.rendering.settings import Settings
@@ -77,7 +78,7 @@ def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> 
         return Rendering(rgb, alpha, depth, RenderStats(steps))
     if at_hand:
         where = compiled_seen(scene, settings)
-        part = functools.partial(_compiled_pixels, scene, camera, settings, where)
+        part = functools.partial(_program, scene, camera, settings, where)
         (rgb, alpha, depth), steps = joined(height, width, in_parts(part, height, width, settings.tile))
     else:
         where = seen(scene, settings)
@@ -106,4 +107,4 @@ def _in_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, where: S
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tiles)
 
 
-_compiled_pixels = jax.jit(_render_blocks, static_argnums=2)
+_program = program(_render_blocks, static_argnums=2)

@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Int
 
 from jvr.parallel import in_threads, workers
@@ -22,11 +21,6 @@ from jvr.parallel import in_threads, workers
 SIDE = 4
 # Rays that are worth a program of their own.
 LEAST = 4096
-
-
-def is_traced(tree: Any) -> bool:
-    """Whether any array of `tree` is being traced, or whatever is computed now."""
-    return any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jax.tree.leaves(tree)))
 
 
 def block_shape(height: int, width: int) -> tuple[int, int]:

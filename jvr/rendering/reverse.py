@@ -19,8 +19,8 @@ from jvr.march.march import Marched, MarchOptions, Noted, integrate
 from jvr.march.rules import is_zero, wanted_and_fixed
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.parallel import in_threads, workers
-from jvr.rendering.parts import block_shape, dealt, dealt_blocks, in_parts, is_traced, joined, pixels_of
+from jvr.parallel import in_threads, is_traced, program, workers
+from jvr.rendering.parts import block_shape, dealt, dealt_blocks, in_parts, joined, pixels_of
 from jvr.rendering.settings import Settings
 from jvr.rendering.trace import Pixels, Seen, aim, compiled_seen, develop
 
@@ -78,7 +78,7 @@ def _backward_rule(settings: Settings, residuals: Any, cotangent: tuple[Pixels, 
 reversible.defvjp(_forward_rule, _backward_rule, symbolic_zeros=True)
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
+@functools.partial(program, static_argnums=(2, 3))
 def _march(scene: Scene, camera: AbstractCamera, settings: Settings, for_replay: bool, where: Seen, blocks: Int[Array, "blocks"]):
     """Some blocks of the picture, the samples taken for each pixel, and `for_replay` what that needs."""
     aimed, t_in = aim(scene, camera, settings, pixels_of(blocks, camera.height, camera.width), where)
@@ -87,7 +87,7 @@ def _march(scene: Scene, camera: AbstractCamera, settings: Settings, for_replay:
     return (develop(scene, gathered, aimed.rays, t_in), gathered.steps), done
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(program, static_argnums=0)
 def _replay(settings: Settings, wanted: Any, fixed: Any, where: Seen, done: _Done, cotangent: tuple[Any, ...]) -> Any:
     """The gradient in what is `wanted` of the scene and the camera; a `None` among the cotangents of `Pixels` is a zero."""
 
