@@ -162,6 +162,7 @@ def test_vmap_keeps_to_its_tiles(small_parts, monkeypatch):
     np.testing.assert_allclose(both[1], picture(jnp.float32(1 / 200)), rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_in_parts_under_vmap_and_over_again(small_parts):
     """Of several scenes at a time, and of several weighted sums of one picture at a time."""
     scene = scene_of(1)

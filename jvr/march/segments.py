@@ -15,7 +15,7 @@ from jvr.numerics import computed_once, mean_depth
 from jvr.types import Channels, Scalar
 
 # Leaps before a ray is started.
-FIRST_LEAPS = 4
+FIRST_LEAPS = 8
 
 
 class Lanes(NamedTuple):
