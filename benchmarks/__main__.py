@@ -26,7 +26,7 @@ def main() -> None:
         "names",
         nargs="*",
         metavar="NAME",
-        help=f"of {', '.join(names)} ; all by default, scattering as a part of peers, accelerator where there is one",
+        help=f"of {', '.join(names)}; all by default, scattering as a part of peers, accelerator where there is one",
     )
     parser.add_argument("--json", metavar="FILE", help="also write the result to FILE")
     parser.add_argument(
