@@ -7,19 +7,23 @@ busy. Programs that do not wait for each other are therefore run from threads; t
 import concurrent.futures
 import functools
 import os
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
+import numpy as np
 from jax.core import Tracer
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+_ZERO = np.float32(0)
+
 
 def is_traced(tree: Any) -> bool:
     """Whether any array of `tree` is being traced, or whatever is computed now."""
-    return any(isinstance(x, Tracer) for x in (jax.numpy.zeros(()), *jax.tree.leaves(tree)))
+    return any(isinstance(x, Tracer) for x in jax.tree.leaves(tree)) or isinstance(jax.lax.neg(_ZERO), Tracer)
 
 
 def program(function: Callable[..., Result], static_argnums: int | tuple[int, ...] = ()) -> Callable[..., Result]:
@@ -61,15 +65,25 @@ def workers() -> int:
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """`function` of every item, in order, as many at a time as there are `workers`; each result is waited for.
 
-    Not traceable. JAX's settings that belong to a thread do not reach the others, but for double precision.
+    Within one of these threads, one after the other. Not traceable. JAX's settings that belong to a thread do not reach the others, but
+    for double precision.
     """
-    double = jax.numpy.zeros(()).dtype == jax.numpy.float64
+    double = jax.config.jax_enable_x64
 
     def one(item: Item) -> Result:
         with jax.enable_x64(double):
             return jax.block_until_ready(function(item))
 
-    if min(workers(), len(items)) < 2:
+    if min(workers(), len(items)) < 2 or getattr(_this_thread, "is_worker", False):
         return [one(item) for item in items]
-    with concurrent.futures.ThreadPoolExecutor(workers()) as pool:
-        return list(pool.map(one, items))
+    return list(_threads(workers()).map(one, items))
+
+
+_this_thread = threading.local()
+
+
+@functools.cache
+def _threads(number: int) -> concurrent.futures.ThreadPoolExecutor:
+    """Threads that stay: starting some takes longer than a small picture's part."""
+    mark = lambda: setattr(_this_thread, "is_worker", True)
+    return concurrent.futures.ThreadPoolExecutor(number, thread_name_prefix="jvr", initializer=mark)

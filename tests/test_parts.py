@@ -41,6 +41,12 @@ def test_double_precision_reaches_the_threads(small_parts, x64):
     assert picture.rgb.dtype == jnp.float64
 
 
+def test_threads_within_threads_do_not_wait_for_each_other(small_parts):
+    """As many at each level as there are threads: none is left for what they wait for."""
+    table = parallel.in_threads(lambda i: parallel.in_threads(lambda j: (i, j), range(4)), range(4))
+    assert table == [[(i, j) for j in range(4)] for i in range(4)]
+
+
 def test_arrays_that_a_traced_function_closes_over_are_part_of_it():
     scene = scene_of(0)
     camera = perspective(scene.volume, 8, 6)

@@ -97,7 +97,11 @@ def to_jvr(scene: scenes.Scene) -> tuple[jvr.Scene, jvr.PerspectiveCamera]:
 
 def _loss(entries: Any, scene: jvr.Scene, camera: jvr.PerspectiveCamera, settings: jvr.Settings) -> tuple[jax.Array, jax.Array]:
     picture = jvr.render(eqx.tree_at(ENTRIES, scene, entries), camera, settings).rgb
-    return jnp.mean(jnp.square(picture - 0.5)), picture
+    return _difference(picture), picture
+
+
+# Operation by operation it would take as long as a small picture.
+_difference = jax.jit(lambda picture: jnp.mean(jnp.square(picture - 0.5)))
 
 
 def _scene(scene: scenes.Scene) -> jvr.Scene:
