@@ -273,6 +273,7 @@ def test_all_samples_are_those_of_pre_integration():
     np.testing.assert_array_equal(picture.stats.steps.max(), np.ceil(25 / 0.5))
 
 
+@pytest.mark.slow
 def test_a_pyramid_that_is_sampled_everywhere_is_the_full_picture(full):
     s = scene()
     picture = render(s, view(s), on_slices(2))

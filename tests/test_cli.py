@@ -199,6 +199,7 @@ def test_plan_and_info_as_text_and_json(tmp_path, capsys):
     assert "0 ... 23" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_goes_on_to_the_same_answer(tmp_path, capfd, monkeypatch):
     assert cli.run(["fit", "fit.toml", "-o", "whole", "--json"]) == 0
     whole = json.loads(capfd.readouterr().out)
@@ -253,6 +254,7 @@ def _folder_of_a_fit(folder, printed):
     assert report["views"]["mean_psnr"] == pytest.approx(-10 * np.log10(mean), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_fit_of_light_through_the_command_line(tmp_path, capsys):
     """With a transfer function of the gradient, which is no curve to draw."""
     (tmp_path / "light.toml").write_text(LIGHT)
@@ -397,6 +399,7 @@ def cached(tmp_path, monkeypatch):
     (tmp_path / "natural.toml").write_text(NATURAL)
 
 
+@pytest.mark.slow
 def test_what_is_computed_beforehand_is_said_and_kept(cached, tmp_path, capsys):
     """By the second command it is read, and the picture is the same."""
     pictures = []

@@ -300,6 +300,7 @@ def test_radiance_transfer_with_the_materials_colour_is_that_of_the_start():
     assert found.scene.radiance_transfer.outdated(found.scene.transfer, found.scene.material) == ()
 
 
+@pytest.mark.slow
 def test_a_fit_of_the_light_starts_from_another_environment(sky):
     """A table that names its kind replaces the whole: nothing of the image's keys is left."""
     start = "fit.initial={environment={kind='constant',order=2},material={reflectance=0.5}}"

@@ -116,7 +116,9 @@ def test_transfer_functions(kind, rows, x64):
     check_every_way(parameters(TRANSFERS[kind]()), ("transfer", "intercept"), rows=rows)
 
 
-@pytest.mark.parametrize("optical", [jvr.EmissionOnly(), jvr.AbsorptionOnly()], ids=["emission", "absorption"])
+@pytest.mark.parametrize(
+    "optical", [jvr.EmissionOnly(), pytest.param(jvr.AbsorptionOnly(), marks=pytest.mark.slow)], ids=["emission", "absorption"]
+)
 def test_optical_models(optical, x64):
     p = parameters(TRANSFERS["table, coloured"]())
     names = ("transfer", "eye") if isinstance(optical, jvr.EmissionOnly) else ("voxels", "eye")
@@ -148,7 +150,7 @@ def test_tiles_and_no_jit(x64):
     [
         (jax.grad, jvr.Replay()),
         (jax.jacfwd, jvr.Forward()),
-        (jax.grad, jvr.Rows()),
+        pytest.param(jax.grad, jvr.Rows(), marks=pytest.mark.slow),
         pytest.param(jax.jacfwd, jvr.Rows(), marks=pytest.mark.slow),
     ],
     ids=["replay", "forward", "rows, reverse", "rows, forward"],
@@ -166,7 +168,10 @@ def test_vmapped(transform, adjoint, x64):
     agree(batch, alone, ROUNDING)
 
 
-@pytest.mark.parametrize(("kind", "termination"), [("linear", 0.2), ("table, coloured", 0.0), ("linear, coloured", 0.2)])
+@pytest.mark.parametrize(
+    ("kind", "termination"),
+    [("linear", 0.2), ("table, coloured", 0.0), pytest.param("linear, coloured", 0.2, marks=pytest.mark.slow)],
+)
 def test_rows_of_a_table(kind, termination, x64):
     """Without distances, rows of a table come out of one replay with hat functions."""
     p = parameters(TRANSFERS[kind]())
@@ -207,6 +212,7 @@ def test_modes_that_a_way_does_not_have_are_refused(x64):
         jax.eval_shape(jax.grad(make_loss(p, jvr.Forward())), moving)
 
 
+@pytest.mark.slow
 def test_memory_of_a_gradient_does_not_grow_with_the_steps():
     """Temporary memory of the compiled gradient: at most 300 bytes a ray and two volumes, whatever the step."""
     size, n = 64, 24

@@ -204,6 +204,7 @@ def test_advice_points_out_what_cannot_show():
     assert "lights[0] AmbientLight is not seen: shading.ambient is zero" in list(remarks_on(unseen, None))
 
 
+@pytest.mark.slow
 def test_advice_measures_what_effects_show():
     one, camera = dark_scene()
     one = dataclasses.replace(one, lights=one.lights[1:], shading=None)

@@ -28,6 +28,7 @@ def ran(module, monkeypatch, tmp_path):
     return json.loads(numbers.read_text()), picture.stat().st_size
 
 
+@pytest.mark.slow
 def test_the_contact_sheet_shows_every_effect_once(embedded):
     (of,) = contact_sheet.subjects(8)
     groups = [contact_sheet.shaded, contact_sheet.normals, contact_sheet.shadowed, contact_sheet.lit, contact_sheet.scattering]

@@ -111,7 +111,12 @@ def _problem(loss=None, exposure=None, unknowns=both) -> Problem:
 
 
 @pytest.mark.parametrize(
-    ("names", "loss"), [("entries", jvr.SquaredError()), ("everything", jvr.Huber(0.05)), ("coloured", jvr.AbsoluteError(0.01))]
+    ("names", "loss"),
+    [
+        ("entries", jvr.SquaredError()),
+        ("everything", jvr.Huber(0.05)),
+        pytest.param("coloured", jvr.AbsoluteError(0.01), marks=pytest.mark.slow),
+    ],
 )
 def test_normal_equations_have_the_gradient_of_the_objective(loss, names, x64):
     scene = jax.tree.map(lambda x: x.astype(float), TRUTH)
@@ -308,6 +313,7 @@ def test_colours_given_extinction_are_exact():
     np.testing.assert_allclose(solved.transfer.rgb, TRUTH.transfer.rgb, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_voxels_are_found_by_a_first_order_solver():
     start = eqx.tree_at(lambda s: s.volume.values, TRUTH, TRUTH.volume.values + 0.05)
     solver = optx.OptaxMinimiser(optax.adam(0.01), rtol=0.0, atol=0.0)
@@ -360,6 +366,7 @@ def test_held_out_views_are_scored():
     assert 0.99 < similarity <= 1
 
 
+@pytest.mark.slow
 def test_held_out_views_may_differ_in_size():
     wide = jvr.PerspectiveCamera(CAMERAS[0].world_from_camera, 30.0, 9, 8)
     result = fit(max_steps=1, held_out=((*CAMERAS, wide), [*IMAGES, np.zeros((8, 9, 3))]), exposure=True)

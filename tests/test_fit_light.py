@@ -52,6 +52,7 @@ def test_asymmetry_albedo_and_direction(volume):
     assert np.linalg.norm(result.scene.lights[0].direction) == pytest.approx(1, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_only_the_product_of_albedo_and_irradiance_is_determined(volume):
     cameras, images = views(scene(volume))
     unknowns = lambda s: (s.scattering.phase.g, s.scattering.albedo, s.lights[0].irradiance)

@@ -74,6 +74,7 @@ def test_the_light_of_a_picture_in_one_step(volume):
     assert 0.5 < np.sqrt(np.mean(np.square(deviation))) < 1.5
 
 
+@pytest.mark.slow
 def test_only_products_of_light_and_material_are_determined(volume):
     truth = scene(volume, environment=jvr.EnvironmentLight(np.linspace(2.0, 1.0, 12).reshape(4, 3), clamped=False))
     cameras, images = views(truth)
@@ -142,6 +143,7 @@ def test_rows_refuse_light_that_changes_on_its_way(volume, unknown):
         jax.eval_shape(jax.jacfwd(image), select(one))
 
 
+@pytest.mark.slow
 def test_rows_under_a_frozen_transfer(volume, frozen):
     """Where in a segment light is looked up depends on its extinction: that is part of the rows."""
     (camera, *_) = jvr.fibonacci_sphere(volume.center, 16.0, 1, 34.0, 6, 6)

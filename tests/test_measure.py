@@ -15,6 +15,7 @@ ENTRIES: Any = lambda scene: (scene.transfer.rgb, scene.transfer.sigma_t)
 CAMERA = perspective(VOLUME, 12, 10)
 
 
+@pytest.mark.slow
 def test_finer_steps_cost_more_samples_and_err_less():
     settings = [jvr.Settings(step, termination=0.0) for step in (2.0, 0.25)]
     found = jvr.measure(SCENE, CAMERA, settings, repeats=1, unknowns=ENTRIES)

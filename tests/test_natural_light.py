@@ -104,7 +104,7 @@ MATERIALS = {
 }
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("name", ["lambert", pytest.param("blinn-phong", marks=pytest.mark.slow), "microfacet", "phase"])
 def test_what_is_reflected_is_the_integral_of_material_and_light(name):
     """Against the sum over directions of the material's own projection in the world."""
     brdf, env = MATERIALS[name], light()
@@ -148,6 +148,7 @@ def test_a_vanishing_gradient_shows_the_mean_of_the_light():
     np.testing.assert_allclose(picture(lit), picture(unlit) * mean, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_materials_by_value_are_linear_between_their_positions():
     kinds = jvr.LambertBRDF(0.2), jvr.BlinnPhongBRDF(0.6, 0.0)
     both = jvr.MaterialByValue([0.0, 1.0], kinds).projected(3)
@@ -257,6 +258,7 @@ def test_a_white_medium_that_bleeds_hides_nothing(exact):
     np.testing.assert_allclose(picture(lit), picture(without), rtol=0.03)
 
 
+@pytest.mark.slow
 def test_material_and_transfer_bleed_alike_where_the_material_reflects_all():
     kinds = [jvr.RadianceTransfer(resolution=1.0, bleeding=kind) for kind in (jvr.TransferBleeding(), jvr.MaterialBleeding())]
     coefficients = [transfer_at(scene(jvr.LambertBRDF(1.0), kind))[0] for kind in kinds]
@@ -271,6 +273,7 @@ def test_clipped_medium_is_not_in_the_way():
     np.testing.assert_allclose(c[:, 0, 0], CONSTANT, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_luma_and_colour_differences_are_the_same_colours():
     transfer = jvr.RadianceTransfer(resolution=1.0, bleeding=jvr.TransferBleeding(), chromaticity=3)
     whole = picture(scene(transfer=jvr.RadianceTransfer(resolution=1.0, bleeding=jvr.TransferBleeding())))
@@ -300,6 +303,7 @@ def test_the_scattering_pass_is_the_direct_sum(dipole):
             np.testing.assert_allclose(found[i][channel], dipole.total[channel] * mean, rtol=2e-3, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_computed_beforehand_and_in_the_picture_are_the_same(tmp_path):
     lit = scene(transfer=jvr.RadianceTransfer(rays=16), shape=(7, 9, 8))
     shares = []
@@ -374,7 +378,8 @@ def test_rays_inside_of_an_opaque_medium_do_not_turn_with_roundings():
     np.testing.assert_allclose(single, double, atol=1e-4)
 
 
-@pytest.mark.parametrize("order", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [0, 1])
 def test_a_light_of_low_order_casts_the_shadows_of_its_transfer(order):
     """The exact product under a light and under the same with bands of zeros; so does what was computed beforehand."""
     low = light(order)

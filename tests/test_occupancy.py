@@ -101,6 +101,7 @@ def test_picture_is_the_same(seed, slope, dtype):
         np.testing.assert_array_equal(pictures(bricked, camera, True).stats.steps, on.stats.steps)
 
 
+@pytest.mark.slow
 def test_pre_integrated_picture_is_the_same(x64):
     """A segment is left out only where no scalar between its ends is visible, also where the ends lie in two bricks."""
     program = jax.jit(jvr.render, static_argnums=2)

@@ -131,10 +131,10 @@ def kinds_of_scenes():
     }
 
 
-SLOW_KINDS = (pytest.param(kind, marks=pytest.mark.slow) for kind in ("pre-integrated, in tiles", "negligible"))
+SLOW_KINDS = (pytest.param(kind, marks=pytest.mark.slow) for kind in ("lit", "pre-integrated, in tiles", "negligible"))
 
 
-@pytest.mark.parametrize("kind", ["lit", "by gradient", *SLOW_KINDS])
+@pytest.mark.parametrize("kind", ["by gradient", *SLOW_KINDS])
 def test_every_kind_of_scene_has_its_derivative_in_parts(small_parts, x64, kind):
     scene, settings = kinds_of_scenes()[kind]
     # (Rays of no symmetry: a sample on the face of a voxel has one gradient or the other, by a rounding.)
@@ -144,6 +144,7 @@ def test_every_kind_of_scene_has_its_derivative_in_parts(small_parts, x64, kind)
     jax.tree.map(close, of(arrays), compiled(of)(arrays))
 
 
+@pytest.mark.slow
 def test_numbers_of_python_have_derivatives_in_parts():
     scene = scene_of(1)
     camera = perspective(scene.volume, 8, 6)
@@ -158,6 +159,7 @@ def test_there_is_one_part_for_each_core(monkeypatch, size):
     assert len(parts.in_parts(lambda blocks: blocks, *size, 10**6)) == 3
 
 
+@pytest.mark.slow
 def test_vmap_keeps_to_its_tiles(small_parts, monkeypatch):
     sizes, camera = [], perspective(jvr.Volume(np.zeros((9, 7, 8))), 16, 12)
     monkeypatch.setattr(reverse, "pixels_of", lambda *a: sizes.append(parts.pixels_of(*a).size) or parts.pixels_of(*a))
@@ -229,6 +231,7 @@ SHAPES = st.tuples(*[st.integers(1, 9)] * 3)
 values_at = jax.jit(lambda volume, points: jax.vmap(volume.sample)(points))
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**31), SHAPES)
 @settings(max_examples=20, deadline=None)
 def test_packed_voxels_are_the_voxels(seed, shape):

@@ -202,7 +202,9 @@ def test_optical_depth_of_a_ray_does_not_depend_on_the_step(segments):
     np.testing.assert_allclose(dtau[:, 0].sum(), sigma.sum() / 63, rtol=2e-6)
 
 
-@BOTH
+@pytest.mark.parametrize(
+    "make", [linear_transfer, pytest.param(coloured_table, marks=pytest.mark.slow)], ids=["linear", "coloured table"]
+)
 def test_close_ends_keep_every_digit_in_value_and_gradient(make):
     """Ends that are equal, or apart by 1e-7 ... 1: at entries, across them, beside them and outside, in both directions."""
     table = make()

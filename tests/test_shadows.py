@@ -155,6 +155,7 @@ def test_shadow_map_is_hard_where_exact_shadows_are_soft(x64):
     assert "does not converge" in jvr.ShadowMap.__doc__
 
 
+@pytest.mark.slow
 def test_shadow_map_is_detached(x64):
     """The derivative in the light's irradiance is there; nothing comes through the map."""
     light, volume = lights(cloud())["directional"], cloud()
@@ -372,7 +373,8 @@ def test_a_clipping_box_with_shadows(x64):
         np.testing.assert_allclose(gradient, expected, atol=1e-6 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("shadows", [jvr.ShadowRays(0.5), pytest.param(jvr.ShadowVolume(1.0), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("shadows", [jvr.ShadowRays(0.5), jvr.ShadowVolume(1.0)])
 def test_light_moved_and_occluder_thickened(shadows, x64):
     """An occluder between a lamp and a screen, which the camera sees from the side: how bright the screen is against finite
     differences of a size that one would see, in the extinction of the occluder and in the place of the lamp."""
