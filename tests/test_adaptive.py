@@ -302,6 +302,7 @@ def test_the_error_falls_with_the_tolerance(full, oracle):
     assert some <= more < 0.75 * int(full.stats.samples)
 
 
+@pytest.mark.slow
 def test_uniform_matter_is_exact_with_the_coarsest_samples_alone():
     s = scene(values=np.full((26, 25, 24), 0.5))
     exact = render(s, view(s), on_slices(0))

@@ -267,6 +267,7 @@ def test_a_fit_of_light_through_the_command_line(tmp_path, capsys):
     assert isinstance(read_transfer(tmp_path / "out" / "transfer.toml"), jvr.GradientOpacity)
 
 
+@pytest.mark.slow
 def test_images_in_files_can_be_fitted_and_must_fit_their_cameras(tmp_path, capfd):
     assert cli.run(["render", "fit.toml", "-o", "t.exr"]) == 0
     (tmp_path / "images.toml").write_text(

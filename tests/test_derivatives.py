@@ -106,7 +106,7 @@ def test_every_parameter_at_once(x64):
 @pytest.mark.parametrize(
     ("kind", "rows"),
     [
-        ("linear, coloured", (jax.grad,)),
+        pytest.param("linear, coloured", (jax.grad,), marks=pytest.mark.slow),
         ("table", ()),
         ("Gaussians", ()),
         pytest.param("Gaussians, coloured", (jax.jacfwd, jax.grad), marks=pytest.mark.slow),

@@ -171,6 +171,7 @@ def test_robust_losses_ignore_outliers():
     assert absolute < squared / 3
 
 
+@pytest.mark.slow
 def test_unknowns_are_told_apart_by_their_place():
     """Not by their shape, and not by which array they hold: here two fields hold the same one."""
     table = jnp.asarray(TRUTH.transfer.rgb)
@@ -195,6 +196,7 @@ def test_weights_take_pixels_out():
     assert psnr(fit(images=spoiled, max_steps=30)) < 30
 
 
+@pytest.mark.slow
 def test_priors_pull_where_images_are_silent():
     flat = eqx.tree_at(lambda s: s.volume.values, START, START.volume.values * 0.5)
     smooth = fit(flat, max_steps=30, priors=(jvr.ColourSmoothness(1e-3), jvr.ExtinctionSmoothness(1e-3)))
@@ -216,9 +218,8 @@ def test_dssim_falls():
     assert result.history[-1].loss < 0.5 * result.history[0].loss
 
 
-@pytest.mark.parametrize(
-    "keywords", [pytest.param({"loss": jvr.AbsoluteError()}, marks=pytest.mark.slow), {"priors": (jvr.ColourSmoothness(1e-2),)}]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("keywords", [{"loss": jvr.AbsoluteError()}, {"priors": (jvr.ColourSmoothness(1e-2),)}])
 def test_psnr_is_that_of_the_pictures_whatever_is_made_small(keywords):
     result = fit(solver=optx.OptaxMinimiser(optax.adam(0.1), rtol=0.0, atol=0.0), max_steps=6, **keywords)
     rendered = np.concatenate([np.ravel(jvr.render(result.scene, c, SETTINGS).rgb) for c in CAMERAS])
@@ -324,7 +325,7 @@ def test_voxels_are_found_by_a_first_order_solver():
         fit(start, unknowns=lambda s: s.volume.values)
 
 
-@pytest.mark.parametrize("solver", [None, optx.BFGS(rtol=1e-8, atol=1e-10)])
+@pytest.mark.parametrize("solver", [None, pytest.param(optx.BFGS(rtol=1e-8, atol=1e-10), marks=pytest.mark.slow)])
 def test_a_fit_that_was_killed_goes_on_to_the_same_answer(tmp_path, solver):
     path = tmp_path / "fit.npz"
     whole = fit(solver=solver, max_steps=8)

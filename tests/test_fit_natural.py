@@ -61,6 +61,7 @@ def problem_of(one, unknowns):
     return problem, jnp.concatenate([jnp.ravel(x) for x in chosen.values(model)])
 
 
+@pytest.mark.slow
 def test_the_light_of_a_picture_in_one_step(volume):
     """It acts linearly: the first step of Gauss and Newton is the solution, within its own standard errors."""
     truth = scene(volume)

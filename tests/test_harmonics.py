@@ -111,6 +111,7 @@ def test_parseval():
         assert float(jnp.sum(c**2)) == pytest.approx(np.sum(weights * polynomial(nodes) ** 2), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_monte_carlo_projection_is_within_its_standard_error():
     polynomial = lambda d: jnp.exp(d[:, 0] - 0.5 * d[:, 2])
     exact = jvr.sh.project(polynomial, 3)
@@ -136,6 +137,7 @@ def test_least_squares_finds_what_incomplete_samples_determine():
     assert np.all(np.isfinite(jvr.sh.fit_samples(d[:5], np.ones(5), 3, ridge=1e-3)))
 
 
+@pytest.mark.slow
 def test_convolution_with_a_kernel():
     kernel = lambda z: jnp.exp(2 * z)
     c, d = coefficients(3), directions(5)

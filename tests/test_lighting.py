@@ -412,6 +412,7 @@ def lit_scene(matrix=OBLIQUE, turn=np.eye(4), scale=1.0, shadows=jvr.ShadowRays(
     )
 
 
+@pytest.mark.slow
 def test_turning_everything_and_the_unit_of_length_change_nothing(x64):
     settings = jvr.Settings(0.5, termination=0)
     volume = jvr.Volume(voxels(), OBLIQUE)

@@ -104,7 +104,9 @@ MATERIALS = {
 }
 
 
-@pytest.mark.parametrize("name", ["lambert", pytest.param("blinn-phong", marks=pytest.mark.slow), "microfacet", "phase"])
+@pytest.mark.parametrize(
+    "name", ["lambert", *(pytest.param(name, marks=pytest.mark.slow) for name in ("blinn-phong", "microfacet")), "phase"]
+)
 def test_what_is_reflected_is_the_integral_of_material_and_light(name):
     """Against the sum over directions of the material's own projection in the world."""
     brdf, env = MATERIALS[name], light()
@@ -248,6 +250,7 @@ def test_transfer_is_a_plain_sum_over_rays():
     np.testing.assert_allclose(c[index, 0], total, rtol=2e-3, atol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exact", [False, True])
 def test_a_white_medium_that_bleeds_hides_nothing(exact):
     """What rays pass is as bright as what is behind it."""
@@ -319,6 +322,7 @@ def test_computed_beforehand_and_in_the_picture_are_the_same(tmp_path):
     np.testing.assert_allclose(picture(jvr.precompute(lit, cache=tmp_path)), picture(lit), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_outdated_transfer_is_announced():
     frozen = jvr.precompute(scene(transfer=jvr.RadianceTransfer(rays=16), shape=(7, 9, 8)))
     changed = dataclasses.replace(frozen, transfer=linear_transfer(seed=5))
@@ -369,6 +373,7 @@ def test_parts_that_do_not_go_together_are_refused(parts):
         jvr.Scene(jvr.Volume(voxels()), linear_transfer(), **({"environment": light(), "material": jvr.LambertBRDF()} | parts))
 
 
+@pytest.mark.slow
 def test_rays_inside_of_an_opaque_medium_do_not_turn_with_roundings():
     """There the transparency is below the precision, and a gradient of it would have any direction."""
     lit = dataclasses.replace(scene(transfer=jvr.RadianceTransfer(rays=8, resolution=1.0)), transfer=linear_transfer(scale=1e2))
@@ -445,6 +450,7 @@ def test_parts_of_another_kind_are_refused(wrong):
         jvr.RadianceTransfer(**wrong)
 
 
+@pytest.mark.slow
 def test_memory_counts_every_channel():
     coloured = linear_transfer(coloured=True)
     transfer = jvr.RadianceTransfer(3, 4, 1.0, memory=4 * 5 * 6 * 7 * 17)

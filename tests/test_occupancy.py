@@ -28,6 +28,7 @@ def test_bricks_bound_the_voxels_around_each_of_their_points(shape, size):
     assert bricks.lower.shape == tuple(max(1, -(-(n - 1) // size)) for n in shape)
 
 
+@pytest.mark.slow
 def test_reach_is_the_largest_known_empty_cube():
     """Against the definition, by brute force."""
     rng = np.random.default_rng(1)

@@ -131,10 +131,8 @@ def kinds_of_scenes():
     }
 
 
-SLOW_KINDS = (pytest.param(kind, marks=pytest.mark.slow) for kind in ("lit", "pre-integrated, in tiles", "negligible"))
-
-
-@pytest.mark.parametrize("kind", ["by gradient", *SLOW_KINDS])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["lit", "by gradient", "pre-integrated, in tiles", "negligible"])
 def test_every_kind_of_scene_has_its_derivative_in_parts(small_parts, x64, kind):
     scene, settings = kinds_of_scenes()[kind]
     # (Rays of no symmetry: a sample on the face of a voxel has one gradient or the other, by a rounding.)

@@ -33,7 +33,7 @@ class Sizes:
 
     voxels: int
     picture: int
-    gradient_picture: int
+    small_picture: int
     growth: tuple[int, ...]
     gradient_growth: tuple[int, ...]
     fit_picture: int
@@ -167,7 +167,7 @@ def fit(size: int, present: list[str], repeats: int) -> dict[str, Any]:
 def empty_space(sizes: Sizes) -> dict[str, float]:
     """What empty space costs `jvr`: the same object in a box of 8 times the volume, and 8 times the voxels with 5 % not empty."""
     object_ = scenes.four(sizes.voxels, sizes.picture)[0]
-    narrow = object_.sized(sizes.gradient_picture, sizes.gradient_picture)
+    narrow = object_.sized(sizes.small_picture, sizes.small_picture)
     few, many = sizes.growth[-2:]
     return {
         "picture_in_8_times_the_box": _pair("draw", object_, scenes.boxed(object_), sizes.repeats),

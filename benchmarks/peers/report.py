@@ -21,6 +21,7 @@ FIGURES = {
     "forward_jvr_over_vtk_gpu": "picture, jvr / VTK GPU mapper, worst of the scenes",
     "forward_jvr_over_compiled": "picture, jvr / C++ loop, worst of the scenes",
     "gradient_torch_over_jvr": "picture and gradient, PyTorch / jvr, worst of the scenes",
+    "small_gradient_torch_over_jvr": "the same in small pictures",
     "absorption_mitsuba_over_jvr": "absorbing medium, Mitsuba / jvr",
     "scattering_mitsuba_over_jvr": "single scattering, Mitsuba / jvr, worst of the media",
     "fit_over_torch_gradient": "whole fit to 60 dB in jvr / one gradient over the same views in PyTorch",
@@ -60,6 +61,7 @@ def results(run: dict[str, Any]) -> str:
         "Pictures": ("forward", "jvr_over", "jvr / {}"),
         "Pictures of a growing sparse volume": ("growth", "jvr_over", "jvr / {}"),
         "Picture and gradient": ("gradient", "over_jvr", "{} / jvr"),
+        "Picture and gradient, small": ("gradient_small", "over_jvr", "{} / jvr"),
         "Picture and gradient of a growing sparse volume": ("gradient_growth", "over_jvr", "{} / jvr"),
     }
     for title, (name, key, ratio) in sections.items():
@@ -88,9 +90,9 @@ def scattering(machine: dict[str, Any], run: dict[str, Any]) -> str:
 def losses(peers: dict[str, Any]) -> list[str]:
     """Every comparison in which a peer was faster, and every one in which it took less memory, worst first."""
     slower, larger = [], []
-    for table, what in (("forward", "picture"), ("growth", "picture"), ("gradient", "gradient"), ("gradient_growth", "gradient")):
+    for table in ("forward", "growth", "gradient", "gradient_small", "gradient_growth"):
         for row in (row for row in peers[table] if "failed" not in row):
-            title = f"{what} of {_about(row)}"
+            title = f"{'gradient' if 'gradient' in table else 'picture'} of {_about(row)}"
             over = {**row.get("jvr_over", {}), **{name: 1 / value for name, value in row.get("over_jvr", {}).items()}}
             slower += [(ratio, title, name) for name, ratio in over.items() if ratio > 1]
             larger += _more_memory(row, title)

@@ -17,10 +17,10 @@ def peers(quick: bool = False) -> dict[str, Any]:
     versions, absent = installed()
     present = list(versions)
     four = scenes.four(sizes.voxels, sizes.picture)
-    small = [scene.sized(sizes.gradient_picture, sizes.gradient_picture) for scene in four]
+    small = [scene.sized(sizes.small_picture, sizes.small_picture) for scene in four]
     growing = (scenes.growing(n, sizes.picture) for n in sizes.growth)
-    fog = scenes.fog(sizes.voxels // 2, sizes.gradient_picture)
-    growing_small = (scenes.growing(n, sizes.gradient_picture) for n in sizes.gradient_growth)
+    fog = scenes.fog(sizes.voxels // 2, sizes.small_picture)
+    growing_small = (scenes.growing(n, sizes.small_picture) for n in sizes.gradient_growth)
     rounds, fewer = sizes.repeats, min(sizes.repeats, 3)
     return _with_figures(
         {
@@ -33,7 +33,8 @@ def peers(quick: bool = False) -> dict[str, Any]:
             "opengl": measure.opengl(present),
             "forward": _rows("forward", measure.forward, four, present, rounds),
             "growth": _rows("growth", measure.forward, growing, present, rounds),
-            "gradient": _rows("gradient", measure.gradient, small, present, fewer),
+            "gradient": _rows("gradient", measure.gradient, four, present, fewer),
+            "gradient_small": _rows("gradient of a small picture", measure.gradient, small, present, fewer),
             "gradient_growth": _rows("growth of the gradient", measure.gradient, growing_small, present, fewer),
             "absorption": _row("absorption", measure.absorption, fog, sizes.absorption_error, present, fewer),
             "scattering": scattered(sizes, present),
@@ -55,7 +56,7 @@ def scattering(quick: bool = False) -> dict[str, Any]:
 
 def scattered(sizes: measure.Sizes, present: list[str]) -> list[dict[str, Any]]:
     """One row for each medium that scatters."""
-    return _rows("scattering", measure.scattering, scenes.scattering(sizes.voxels // 2, sizes.gradient_picture), sizes, present)
+    return _rows("scattering", measure.scattering, scenes.scattering(sizes.voxels // 2, sizes.small_picture), sizes, present)
 
 
 def installed(names: Iterable[str] = RENDERERS) -> tuple[dict[str, str], dict[str, str]]:
@@ -79,6 +80,7 @@ def _with_figures(result: dict[str, Any]) -> dict[str, Any]:
         "forward_jvr_over_vtk_gpu": most(over("forward", "jvr_over", "vtk_gpu")),
         "forward_jvr_over_compiled": most(over("forward", "jvr_over", "compiled")),
         "gradient_torch_over_jvr": least(over("gradient", "over_jvr", "torch")),
+        "small_gradient_torch_over_jvr": least(over("gradient_small", "over_jvr", "torch")),
         "absorption_mitsuba_over_jvr": result["absorption"].get("over_jvr", {}).get("mitsuba"),
         "scattering_mitsuba_over_jvr": least(over("scattering", "over_jvr", "mitsuba")),
         "fit_over_torch_gradient": result["fit"].get("fit_over_torch_gradient"),
