@@ -68,7 +68,7 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
     Within one of these threads, one after the other. Not traceable. JAX's settings that belong to a thread do not reach the others, but
     for double precision.
     """
-    double = jax.config.jax_enable_x64
+    double = jax.dtypes.canonicalize_dtype(np.float64) == np.float64
 
     def one(item: Item) -> Result:
         with jax.enable_x64(double):
