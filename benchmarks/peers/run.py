@@ -17,6 +17,9 @@ def peers(quick: bool = False) -> dict[str, Any]:
     versions, absent = installed()
     present = list(versions)
     four = scenes.four(sizes.voxels, sizes.picture)
+    if quick:
+        # Scans are not made smaller.
+        four = [scene for scene in four if max(scene.voxels.shape) == sizes.voxels]
     small = [scene.sized(sizes.small_picture, sizes.small_picture) for scene in four]
     growing = (scenes.growing(n, sizes.picture) for n in sizes.growth)
     fog = scenes.fog(sizes.voxels // 2, sizes.small_picture)
