@@ -18,7 +18,9 @@ from jax.core import Tracer
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+# What becomes of an operation on it tells whether operations are traced now.
 _ZERO = np.float32(0)
+_this_thread = threading.local()
 
 
 def is_traced(tree: Any) -> bool:
@@ -76,10 +78,16 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
 
     if min(workers(), len(items)) < 2 or getattr(_this_thread, "is_worker", False):
         return [one(item) for item in items]
-    return list(_threads(workers()).map(one, items))
-
-
-_this_thread = threading.local()
+    threads = _threads(workers())
+    futures = [threads.submit(one, item) for item in items]
+    try:
+        concurrent.futures.wait(futures, return_when=concurrent.futures.FIRST_EXCEPTION)
+    finally:
+        # After an error nothing goes on that would take memory from what the caller does about it.
+        for future in futures:
+            future.cancel()
+        concurrent.futures.wait(futures)
+    return [future.result() for future in futures]
 
 
 @functools.cache

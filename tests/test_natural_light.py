@@ -373,7 +373,6 @@ def test_parts_that_do_not_go_together_are_refused(parts):
         jvr.Scene(jvr.Volume(voxels()), linear_transfer(), **({"environment": light(), "material": jvr.LambertBRDF()} | parts))
 
 
-@pytest.mark.slow
 def test_rays_inside_of_an_opaque_medium_do_not_turn_with_roundings():
     """There the transparency is below the precision, and a gradient of it would have any direction."""
     lit = dataclasses.replace(scene(transfer=jvr.RadianceTransfer(rays=8, resolution=1.0)), transfer=linear_transfer(scale=1e2))

@@ -1,5 +1,7 @@
 """Pictures of arrays at hand, in parts; volumes packed for interpolation."""
 
+import time
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -45,6 +47,21 @@ def test_threads_within_threads_do_not_wait_for_each_other(small_parts):
     """As many at each level as there are threads: none is left for what they wait for."""
     table = parallel.in_threads(lambda i: parallel.in_threads(lambda j: (i, j), range(4)), range(4))
     assert table == [[(i, j) for j in range(4)] for i in range(4)]
+
+
+def test_nothing_goes_on_after_an_error(small_parts):
+    begun, ended = [], []
+
+    def one(i):
+        begun.append(i)
+        if i == 0:
+            raise ValueError("the first")
+        time.sleep(0.05)
+        ended.append(i)
+
+    with pytest.raises(ValueError, match="the first"):
+        parallel.in_threads(one, range(50))
+    assert len(begun) == len(ended) + 1 < 50
 
 
 def test_arrays_that_a_traced_function_closes_over_are_part_of_it():

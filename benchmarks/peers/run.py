@@ -16,10 +16,8 @@ def peers(quick: bool = False) -> dict[str, Any]:
     sizes = measure.QUICK if quick else measure.FULL
     versions, absent = installed()
     present = list(versions)
-    four = scenes.four(sizes.voxels, sizes.picture)
-    if quick:
-        # Scans are not made smaller.
-        four = [scene for scene in four if max(scene.voxels.shape) == sizes.voxels]
+    # Scans are not made smaller.
+    four = (scenes.from_formulas if quick else scenes.four)(sizes.voxels, sizes.picture)
     small = [scene.sized(sizes.small_picture, sizes.small_picture) for scene in four]
     growing = (scenes.growing(n, sizes.picture) for n in sizes.growth)
     fog = scenes.fog(sizes.voxels // 2, sizes.small_picture)

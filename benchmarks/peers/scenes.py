@@ -67,8 +67,16 @@ class Scene:
 def four(n: int, size: int) -> list[Scene]:
     """Opaque bone, translucent skin, sparse vessels and a smooth simulation, each in a picture of `size` x `size`: from formulas
     with `n` voxels a side, and from scans where `$JVR_DATA` has them."""
+    return from_formulas(n, size) + from_scans(size)
+
+
+def from_formulas(n: int, size: int) -> list[Scene]:
     body, vessels = ("phantom", *shapes.phantom(n)), ("tubes", *shapes.vessels(n))
-    scenes = [_bone(*body, size), _skin(*body, size), _vessels(*vessels, size), simulation(n, size)]
+    return [_bone(*body, size), _skin(*body, size), _vessels(*vessels, size), simulation(n, size)]
+
+
+def from_scans(size: int) -> list[Scene]:
+    scenes = []
     torso, carotid = _scan("ct_torso/example_ct.nii.gz"), _scan("carotid/carotid.vtk")
     if torso:
         scenes += [_bone("CT of a torso", *torso, size), _skin("CT of a torso", *torso, size)]
