@@ -73,6 +73,23 @@ def gradient() -> dict[str, Any]:
     }
 
 
+def parts() -> dict[str, Any]:
+    """Image and gradient in a transfer function: in parts, as a function that is not compiled as a whole has it, over one program."""
+    volume, settings, found = scenes.gyroid(), jvr.Settings(0.5), {}
+    difference = jax.jit(lambda rgb: jnp.mean(jnp.square(rgb - 0.5)))
+    for kind, transfer in {"opaque": scenes.opaque(), "translucent": scenes.translucent()}.items():
+        for size in (128, 400):
+            scene, camera = jvr.Scene(volume, transfer), scenes.camera(volume, size)
+            loss = lambda t, scene=scene, camera=camera: difference(
+                jvr.render(eqx.tree_at(lambda s: s.transfer, scene, t), camera, settings).rgb
+            )
+            in_parts = jax.value_and_grad(loss)
+            whole = jax.jit(in_parts)
+            times = seconds({"parts": lambda f=in_parts, t=transfer: f(t), "whole": lambda f=whole, t=transfer: f(t)})
+            found[f"{kind}_{size}_parts_over_whole"] = ratio(times, "parts", "whole")
+    return found
+
+
 def memory() -> dict[str, Any]:
     """Compiled temporary memory of a gradient, per ray in flight beyond two volumes, at two step lengths."""
     volume = scenes.gyroid(64)
@@ -159,4 +176,12 @@ def startup() -> dict[str, Any]:
     return {"import_beyond_jax": statistics.median(imports), "render_cold": cold, "render_warm": warm}
 
 
-CASES = {"forward": forward, "gradient": gradient, "memory": memory, "light": light, "fitting": fitting, "startup": startup}
+CASES = {
+    "forward": forward,
+    "gradient": gradient,
+    "parts": parts,
+    "memory": memory,
+    "light": light,
+    "fitting": fitting,
+    "startup": startup,
+}
