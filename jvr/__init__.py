@@ -72,6 +72,9 @@ if TYPE_CHECKING:
     from jvr.fitting.fit import fit as fit
     from jvr.fitting.initialise import colours_given_extinction as colours_given_extinction
     from jvr.fitting.initialise import flat_transfer as flat_transfer
+    from jvr.fitting.least_squares import Dogleg as Dogleg
+    from jvr.fitting.least_squares import GaussNewton as GaussNewton
+    from jvr.fitting.least_squares import LevenbergMarquardt as LevenbergMarquardt
     from jvr.fitting.losses import DSSIM as DSSIM
     from jvr.fitting.losses import AbsoluteError as AbsoluteError
     from jvr.fitting.losses import ColourSmoothness as ColourSmoothness
@@ -79,15 +82,13 @@ if TYPE_CHECKING:
     from jvr.fitting.losses import Huber as Huber
     from jvr.fitting.losses import Sparsity as Sparsity
     from jvr.fitting.losses import SquaredError as SquaredError
+    from jvr.fitting.minimisers import LBFGSB as LBFGSB
     from jvr.fitting.residuals import residuals as residuals
-    from jvr.fitting.solvers import LBFGSB as LBFGSB
-    from jvr.fitting.solvers import Dogleg as Dogleg
-    from jvr.fitting.solvers import GaussNewton as GaussNewton
-    from jvr.fitting.solvers import LevenbergMarquardt as LevenbergMarquardt
-    from jvr.fitting.unknowns import Identity as Identity
-    from jvr.fitting.unknowns import Ordered as Ordered
-    from jvr.fitting.unknowns import Sigmoid as Sigmoid
-    from jvr.fitting.unknowns import Softplus as Softplus
+    from jvr.fitting.transforms import Bounded as Bounded
+    from jvr.fitting.transforms import Identity as Identity
+    from jvr.fitting.transforms import Ordered as Ordered
+    from jvr.fitting.transforms import Sigmoid as Sigmoid
+    from jvr.fitting.transforms import Softplus as Softplus
     from jvr.io.precompute import precompute as precompute
     from jvr.io.volumes import read_volume as read_volume
     from jvr.model.brdf import BlinnPhongBRDF as BlinnPhongBRDF
@@ -140,8 +141,9 @@ _LATE = {
         "SquaredError",
     ),
     "jvr.fitting.residuals": ("residuals",),
-    "jvr.fitting.solvers": ("LBFGSB", "Dogleg", "GaussNewton", "LevenbergMarquardt"),
-    "jvr.fitting.unknowns": ("Identity", "Ordered", "Sigmoid", "Softplus"),
+    "jvr.fitting.least_squares": ("Dogleg", "GaussNewton", "LevenbergMarquardt"),
+    "jvr.fitting.minimisers": ("LBFGSB",),
+    "jvr.fitting.transforms": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
     "jvr.io.precompute": ("precompute",),
     "jvr.io.volumes": ("read_volume",),
     "jvr.model.material": ("HarmonicMaterial", "MaterialByValue"),

@@ -45,5 +45,6 @@ class Outcome(enum.Enum):
 
     CONVERGED = "converged"
     STEP_LIMIT = "step limit reached"
+    STALLED = "stalled: no step lowers the objective, although it is not at its bottom; the best iterate is kept"
     NON_FINITE = "non-finite value met; the last good iterate is kept"
     INTERRUPTED = "interrupted; the last good iterate is kept"

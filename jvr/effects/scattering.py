@@ -3,6 +3,7 @@ Eurographics 2009, chapters 7.1 to 7.4)."""
 
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
 from jvr.effects.shading import share_of
@@ -10,6 +11,7 @@ from jvr.model.by_value import ByValue, coefficient
 from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractScattering
 from jvr.model.phase import AbstractPhase, Isotropic, ScatteringAngle
+from jvr.model.ranges import POSITIVE, SHARE, within
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 
@@ -28,8 +30,8 @@ class SingleScattering(AbstractScattering):
     """
 
     phase: AbstractPhase
-    albedo: Any
-    threshold: Scalar | None
+    albedo: Any = eqx.field(metadata=within(SHARE))
+    threshold: Scalar | None = eqx.field(metadata=within(POSITIVE))
 
     def __init__(
         self,
@@ -41,7 +43,7 @@ class SingleScattering(AbstractScattering):
         if not isinstance(phase, AbstractPhase):
             raise TypeError(f"phase must be a phase function such as jvr.HenyeyGreenstein(0.5), not {type(phase).__name__}")
         self.phase = phase
-        valid, message = lambda a: (a >= 0) & (a <= 1), "albedo must be a share of the extinguished light, 0 to 1"
+        valid, message = SHARE.holds, "albedo must be a share of the extinguished light, 0 to 1"
         if not isinstance(albedo, ByValue) and np.ndim(albedo) == 1:
             self.albedo = float_array(albedo, "albedo", (3,))
             require(self.albedo, valid, message)
@@ -49,8 +51,7 @@ class SingleScattering(AbstractScattering):
             self.albedo = coefficient(albedo, "albedo", valid, message)
         self.threshold = None if threshold is None else float_array(threshold, "threshold", ())
         if threshold is not None:
-            positive = lambda t: np.isfinite(t) & (t > 0)
-            require(self.threshold, positive, "threshold must be a positive length of the gradient, or None")
+            require(self.threshold, POSITIVE.holds, "threshold must be a positive length of the gradient, or None")
 
     @property
     def needs_gradient(self) -> bool:

@@ -10,14 +10,17 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model.by_value import ByValue, coefficient
 from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractShading
+from jvr.model.ranges import NOT_NEGATIVE, Interval, within
 from jvr.numerics import direction_and_length, divide_or_zero, dot, power_of_cosine
 from jvr.types import ArrayLike, Scalar, Triple
+
+# Of Phong's lobes.
+EXPONENT = Interval(low=1.0)
 
 
 class Lambert(AbstractShading):
@@ -34,9 +37,9 @@ class Lambert(AbstractShading):
     Differentiable in all numbers; detached: which way a normal is turned.
     """
 
-    ambient: Any
-    diffuse: Any
-    threshold: Scalar
+    ambient: Any = eqx.field(metadata=within(NOT_NEGATIVE))
+    diffuse: Any = eqx.field(metadata=within(NOT_NEGATIVE))
+    threshold: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
     two_sided: bool = eqx.field(static=True)
 
     def __init__(
@@ -50,7 +53,7 @@ class Lambert(AbstractShading):
         self.ambient = _share(ambient, "ambient")
         self.diffuse = _share(diffuse, "diffuse")
         self.threshold = float_array(threshold, "threshold", ())
-        require(self.threshold, lambda t: np.isfinite(t) & (t >= 0), "threshold must be a length of the gradient, not negative")
+        require(self.threshold, NOT_NEGATIVE.holds, "threshold must be a length of the gradient, not negative")
         self.two_sided = two_sided
 
     def ambient_share(self) -> Scalar:
@@ -83,8 +86,8 @@ class Phong(Lambert):
     **Arguments:** as `Lambert`, and `specular`, not negative; `shininess`, at least 1. Each a number or `jvr.ByValue`.
     """
 
-    specular: Any
-    shininess: Any
+    specular: Any = eqx.field(metadata=within(NOT_NEGATIVE))
+    shininess: Any = eqx.field(metadata=within(EXPONENT))
 
     def __init__(
         self,
@@ -98,8 +101,7 @@ class Phong(Lambert):
     ):
         super().__init__(ambient, diffuse, threshold=threshold, two_sided=two_sided)
         self.specular = _share(specular, "specular")
-        at_least_1 = lambda e: np.isfinite(e) & (e >= 1)
-        self.shininess = coefficient(shininess, "shininess", at_least_1, "shininess must be an exponent of at least 1")
+        self.shininess = coefficient(shininess, "shininess", EXPONENT.holds, "shininess must be an exponent of at least 1")
 
     def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         twice = 2 * dot(normal, w_i)
@@ -138,4 +140,4 @@ def share_of(magnitude: Float[Array, "..."], threshold: Scalar) -> Float[Array, 
 
 
 def _share(value: ArrayLike | ByValue, name: str) -> Any:
-    return coefficient(value, name, lambda v: np.isfinite(v) & (v >= 0), f"{name} must be finite and not negative")
+    return coefficient(value, name, NOT_NEGATIVE.holds, f"{name} must be finite and not negative")

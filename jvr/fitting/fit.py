@@ -14,11 +14,13 @@ import optimistix as optx
 
 from jvr.fitting import checkpoint as checkpoints
 from jvr.fitting.identifiability import Determination, undetermined
+from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
+from jvr.fitting.minimisers import OptimistixSolver
 from jvr.fitting.objective import Problem, march_unknowns
 from jvr.fitting.observations import Observations, check_images, keep_samples, observe
-from jvr.fitting.solvers import LBFGSB, AbstractSolver, ChunkedLeastSquares, LevenbergMarquardt, OptimistixSolver
-from jvr.fitting.unknowns import Exposed, Identity, Softplus, Unknowns, choose_unknowns
+from jvr.fitting.solvers import AbstractSolver
+from jvr.fitting.unknowns import Exposed, Unknowns, choose_unknowns
 from jvr.fitting.work import Work, fingerprint
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
@@ -203,13 +205,11 @@ def _as_solver(solver: Any) -> AbstractSolver:
 
 
 def _choose(model: Exposed, unknowns: Callable[[Scene], Any], transforms: Any, solver: AbstractSolver) -> Unknowns:
-    """The scene's unknowns and then the exposure. A bounded solver works on the values themselves."""
+    """The scene's unknowns and then the exposure."""
     select = lambda m: (unknowns(m.scene), m.exposure)
     if transforms is not None:
-        transforms = (*transforms, *([Softplus()] if model.exposure is not None else []))
-    elif isinstance(solver, LBFGSB):
-        transforms = (Identity(),) * len(jax.tree.leaves(select(model)))
-    return choose_unknowns(model, select, transforms)
+        transforms = (*transforms, *([None] if model.exposure is not None else []))
+    return choose_unknowns(model, select, transforms, solver.bounds)
 
 
 def _check(problem: Problem, solver: AbstractSolver) -> None:

@@ -1,6 +1,5 @@
 """Which arrays of a scene are unknown, and how each lives on the real line while it is fitted."""
 
-import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -10,122 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jvr.fitting.transforms import AbstractTransform, transform_of
+from jvr.model.ranges import NOT_NEGATIVE, Interval, Range, range_at, within
 from jvr.model.scene import Scene
-from jvr.numerics import normalise
 from jvr.types import Scalar
-
-# How near to the end of its range a start value may lie: at the end itself a transform has no slope and the fit cannot leave.
-MARGIN = 1e-3
-
-
-class AbstractTransform(eqx.Module):
-    """A smooth map from the real line onto the values that an unknown may take."""
-
-    @abc.abstractmethod
-    def forward(self, real: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The value."""
-
-    @abc.abstractmethod
-    def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The real number that gives `value`, or the nearest value that has one."""
-
-    @property
-    @abc.abstractmethod
-    def reach(self) -> float:
-        """How far a linearisation of `forward` is good for, on the real line."""
-
-
-class Identity(AbstractTransform):
-    """Any real value."""
-
-    def forward(self, real: Float[Array, "..."]) -> Float[Array, "..."]:
-        return real
-
-    def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        return value
-
-    @property
-    def reach(self) -> float:
-        return np.inf
-
-
-# Within this distance the curved transforms change their slope by less than an order of magnitude.
-REACH = 2.0
-
-
-class Softplus(AbstractTransform):
-    """Positive values, `scale * log(1 + exp(x))`; `scale` is a typical value, in the unknown's own unit."""
-
-    scale: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
-
-    def forward(self, real: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self.scale * jax.nn.softplus(real)
-
-    def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        ratio = jnp.maximum(value / self.scale, MARGIN)
-        return ratio + jnp.log(-jnp.expm1(-ratio))
-
-    @property
-    def reach(self) -> float:
-        return REACH
-
-
-class Sigmoid(AbstractTransform):
-    """Values between `low` and `high`."""
-
-    low: float = eqx.field(static=True, default=0.0)
-    high: float = eqx.field(static=True, default=1.0)
-
-    def forward(self, real: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self.low + (self.high - self.low) * jax.nn.sigmoid(real)
-
-    def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        share = jnp.clip((value - self.low) / (self.high - self.low), MARGIN, 1 - MARGIN)
-        return jnp.log(share) - jnp.log1p(-share)
-
-    @property
-    def reach(self) -> float:
-        return REACH
-
-
-class Direction(AbstractTransform):
-    """Unit vectors: what has no length to be found."""
-
-    def forward(self, real: Float[Array, "3"]) -> Float[Array, "3"]:
-        return normalise(real)
-
-    def inverse(self, value: Float[Array, "3"]) -> Float[Array, "3"]:
-        return normalise(value)
-
-    @property
-    def reach(self) -> float:
-        # About 30 degrees.
-        return 0.5
-
-
-class Ordered(AbstractTransform):
-    """Strictly increasing values with both ends free: the first as it is, then softplus of every gap over the mean gap."""
-
-    scale: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
-
-    def forward(self, real: Float[Array, "n"]) -> Float[Array, "n"]:
-        gaps = self.scale * jax.nn.softplus(real[1:])
-        return jnp.concatenate([self.scale * real[:1], self.scale * real[0] + jnp.cumsum(gaps)])
-
-    def inverse(self, value: Float[Array, "n"]) -> Float[Array, "n"]:
-        gaps = Softplus(self.scale).inverse(jnp.diff(value))
-        return jnp.concatenate([value[:1] / self.scale, gaps])
-
-    @property
-    def reach(self) -> float:
-        return REACH
 
 
 class Exposed(eqx.Module):
     """A scene and the factor between its radiance and the target images' (`None` where they are in the same unit)."""
 
     scene: Scene
-    exposure: Scalar | None
+    exposure: Scalar | None = eqx.field(metadata=within(NOT_NEGATIVE))
 
 
 class Unknowns(eqx.Module):
@@ -163,30 +57,34 @@ class Unknowns(eqx.Module):
         pairs = zip(self.transforms, self.split(real, model), strict=True)
         return jnp.concatenate([jnp.ravel(transform.forward(part)) for transform, part in pairs])
 
-    def reach(self, model: Exposed) -> Float[np.ndarray, "unknowns"]:
-        """How far each unknown may move in one step on the real line."""
-        return np.concatenate([np.full(v.size, t.reach) for t, v in zip(self.transforms, self.values(model), strict=True)])
+    def limits(self, model: Exposed, real: Float[np.ndarray, "unknowns"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The least and the largest real number of each unknown, and how far it may move from `real` in one step."""
+        parts = [np.atleast_1d(np.asarray(part, np.float64)) for part in self.split(jnp.asarray(real), model)]
+        limits = [(*t.bounds(part), t.reach(part)) for t, part in zip(self.transforms, parts, strict=True)]
+        lower, upper, reach = (np.concatenate([np.ravel(a) for a in arrays]) for arrays in zip(*limits, strict=True))
+        return lower, upper, reach
 
     def model_from_real(self, model: Exposed, real: Float[Array, "unknowns"]) -> Exposed:
         """The model whose unknowns are those of `real`."""
         return self.insert(model, self.split(self.values_from_real(real, model), model))
 
 
-def choose_unknowns(model: Exposed, select: Callable[[Exposed], Any], transforms: Any = None) -> Unknowns:
+def choose_unknowns(
+    model: Exposed, select: Callable[[Exposed], Any], transforms: Any = None, bounds: Interval | None = None
+) -> Unknowns:
     """Finds the arrays that `select` returns among the model's own, and a transform for each.
 
     `select` is called on abstract arrays: it may look at structure and shapes, not at values.
 
-    Without `transforms` (a tuple, one for each array, `None` where the default is wanted), colours, albedo, weights and shares of light
-    that a material reflects get `Sigmoid()`, asymmetries `Sigmoid(-1, 1)`, roughness and indices of refraction `Sigmoid` between their
-    bounds, extinction, heights, widths, coefficients of dipoles and what lights and surfaces have of strength `Softplus`, positions
-    of a table `Ordered`, directions `Direction`, anything else (such as the coefficients of an environment) `Identity`.
+    Without `transforms` (a tuple, one for each array, `None` where the default is wanted) each array keeps to the range that its class
+    declares (`jvr.model.ranges`): for a solver that keeps `bounds` as the values themselves, else by a smooth map.
 
-    **Raises** `ValueError` where an array is not one of the scene's, not floating point or named twice, or the number of transforms
-    differs.
+    **Raises** `ValueError` where an array is not one of the scene's, not floating point, named twice or outside of its range, or the
+    number of transforms differs.
     """
     places = _places(model, select)
-    named = [(_name(path), leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(model)]
+    leaves = jax.tree_util.tree_leaves_with_path(model)
+    named = [(_name(path), leaf) for path, leaf in leaves]
     for name, array in (named[i] for i in places):
         if not eqx.is_inexact_array(array):
             raise ValueError(
@@ -198,8 +96,25 @@ def choose_unknowns(model: Exposed, select: Callable[[Exposed], Any], transforms
         raise ValueError(
             f"there are {len(given)} transforms for {len(places)} unknown arrays ({', '.join(names)}): give one for each"
         )
-    chosen = tuple(t or _default_transform(*named[i], model) for t, i in zip(given, places, strict=True))
+    voxel = jnp.min(model.scene.volume.spacing)
+
+    def default(path: Any, value: Array) -> AbstractTransform:
+        declared = range_at(model, path)
+        _check_start(_name(path).removeprefix("scene."), value, declared)
+        return transform_of(declared, value, voxel, bounds)
+
+    chosen = tuple(t or default(*leaves[i]) for t, i in zip(given, places, strict=True))
     return Unknowns(places, names, chosen)
+
+
+def _check_start(name: str, value: Array, declared: Range) -> None:
+    """A start outside of its range would be moved into it, and the fit would begin from other pictures than the user's."""
+    outside = [] if not isinstance(declared, Interval) else np.asarray(value)[~declared.closed.holds(np.asarray(value))]
+    if np.size(outside):
+        raise ValueError(
+            f"{name} starts at {np.ravel(outside)[0]:g}, outside of {declared}, where a fit keeps it: start inside, or give transforms= "
+            "with jvr.Bounded(low, high), jvr.Softplus(scale) or jvr.Identity() in its place"
+        )
 
 
 def _places(model: Exposed, select: Callable[[Exposed], Any]) -> tuple[int, ...]:
@@ -229,31 +144,3 @@ def _places(model: Exposed, select: Callable[[Exposed], Any]) -> tuple[int, ...]
 
 def _name(path: Any) -> str:
     return jax.tree_util.keystr(path).lstrip(".")
-
-
-def _default_transform(name: str, value: Array, model: Exposed) -> AbstractTransform:
-    field = name.rsplit(".", 1)[-1]
-    of_material = name.startswith("scene.material")
-    if field in ("rgb", "background") or (of_material and field in ("diffuse", "specular")):
-        return Sigmoid()
-    if field in ("sigma_t", "height"):
-        return Softplus(1.0 / jnp.min(model.scene.volume.spacing))
-    if field in ("exposure", "ambient", "diffuse", "specular", "threshold"):
-        return Softplus()
-    if field in ("irradiance", "intensity", "radiance", "shininess", "exponent", "sigma_a", "sigma_s_prime"):
-        return Softplus(jnp.maximum(jnp.mean(value), 1e-3))
-    if field in ("g", "g1", "g2", "k"):
-        return Sigmoid(-1.0, 1.0)
-    if field in ("albedo", "weight", "reflectance", "base", "metallic", "reflectance_at_normal"):
-        return Sigmoid()
-    if field == "roughness":
-        return Sigmoid(1e-3, 1.0)
-    if field == "eta":
-        return Sigmoid(1.0, 3.0)
-    if field == "direction":
-        return Direction()
-    if field == "width":
-        return Softplus(jnp.mean(value))
-    if field == "positions":
-        return Ordered(jnp.mean(jnp.diff(value)))
-    return Identity()

@@ -25,7 +25,7 @@ from jvr.fitting.objective import (
     value,
 )
 from jvr.fitting.observations import Observations, seen_in_fit, thin
-from jvr.fitting.solvers import Functions
+from jvr.fitting.solvers import Functions, Limits
 from jvr.model.camera import AbstractCamera
 from jvr.parallel import in_threads
 from jvr.types import Scalar
@@ -34,6 +34,8 @@ from jvr.types import Scalar
 MOST_THINNING = 16
 # ... and at least so many residuals for each unknown.
 LEAST_RESIDUALS = 24
+# Root mean square of the rounding of pictures, in units of the number format's epsilon and of their own.
+ROUNDING = 16
 
 
 class ValueFunction(eqx.Module):
@@ -110,6 +112,16 @@ class Work:
         slope = np.asarray(_slope(unknowns, model, jnp.asarray(real)), np.float64)
         return slope.T @ gradient, slope.T @ matrix @ slope
 
+    def limits(self, real: np.ndarray) -> Limits:
+        """Where the unknowns may go from a point on the real line."""
+        return Limits(*self.problem.unknowns.limits(self.problem.model, real))
+
+    def _rounding(self) -> float:
+        """The mean squared error of pictures that differ by the rounding of sums along rays alone."""
+        targets, weight = self.levels[-1].target, self.levels[-1].weight
+        mean = float(jnp.sum(weight[:, None] * jnp.square(targets))) / self.total
+        return (ROUNDING * float(jnp.finfo(targets.dtype).eps)) ** 2 * mean
+
     def determination(self, values: Float[Array, "unknowns"]) -> Determination:
         """Standard errors at the solution, over all rays."""
         problem = self.problem
@@ -156,8 +168,7 @@ class Work:
             function = ValueFunction(self.problem, self.pieces, jnp.asarray(self.total))
         residuals = ResidualFunction(self.problem, self.pieces, jnp.asarray(self.total))
         levels = tuple(functools.partial(self.expand, i) for i in range(len(self.levels)))
-        reach = self.problem.unknowns.reach(self.problem.model)
-        return Functions(function, residuals, levels, reach, self.quadratic)
+        return Functions(function, residuals, levels, self.limits, self.quadratic, self._rounding())
 
 
 def fingerprint(problem: Problem, observations: Observations, solver: Any) -> str:

@@ -12,13 +12,14 @@ import abc
 import math
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import float_array, require
 from jvr.model.material import About, AbstractBRDF
 from jvr.model.phase import AbstractPhase, ScatteringAngle, components
+from jvr.model.ranges import NOT_NEGATIVE, SHARE, within
 from jvr.numerics import direction_and_length, power_of_cosine
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
@@ -30,7 +31,7 @@ class LambertBRDF(AbstractBRDF):
     """
 
     about: ClassVar[About] = "normal"
-    reflectance: Float[Array, "..."]
+    reflectance: Float[Array, "..."] = eqx.field(metadata=within(SHARE))
 
     def __init__(self, reflectance: ArrayLike = 1.0):
         self.reflectance = share(reflectance, "reflectance", (), (3,))
@@ -48,16 +49,14 @@ class AbstractGlossyBRDF(AbstractBRDF):
     """
 
     about: ClassVar[About] = "both"
-    diffuse: Float[Array, "..."]
-    specular: Float[Array, "..."]
-    exponent: Scalar
+    diffuse: Float[Array, "..."] = eqx.field(metadata=within(SHARE))
+    specular: Float[Array, "..."] = eqx.field(metadata=within(SHARE))
+    exponent: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, diffuse: ArrayLike, specular: ArrayLike, exponent: ArrayLike):
         self.diffuse, self.specular = share(diffuse, "diffuse", (), (3,)), share(specular, "specular", (), (3,))
         self.exponent = float_array(exponent, "exponent", ())
-        require(
-            self.exponent, lambda e: np.isfinite(e) & (e >= 0), "exponent must be finite and not negative; 30 is a soft highlight"
-        )
+        require(self.exponent, NOT_NEGATIVE.holds, "exponent must be finite and not negative; 30 is a soft highlight")
 
     @abc.abstractmethod
     def lobe(self, w_o: Triple, w_i: Triple) -> Float[Array, "..."]:
@@ -112,7 +111,7 @@ class PhaseBRDF(AbstractBRDF):
 
     about: ClassVar[About] = "eye"
     phase: AbstractPhase
-    albedo: Float[Array, "..."]
+    albedo: Float[Array, "..."] = eqx.field(metadata=within(SHARE))
 
     def __init__(self, phase: AbstractPhase, albedo: ArrayLike = 1.0):
         self.phase, self.albedo = phase, share(albedo, "albedo", (), (3,))
@@ -151,5 +150,5 @@ def where_or_normal(lit: Bool[Array, "..."], w: Triple) -> Triple:
 def share(value: ArrayLike, name: str, *shapes: tuple[int, ...]) -> Float[Array, "..."]:
     """A share between 0 and 1 as an array of one of the shapes."""
     array = float_array(value, name, *shapes)
-    require(array, lambda a: (a >= 0) & (a <= 1), f"{name} must be in [0, 1], a share of the light")
+    require(array, SHARE.holds, f"{name} must be in [0, 1], a share of the light")
     return array

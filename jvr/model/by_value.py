@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model.checks import float_array, require
+from jvr.model.ranges import Increasing, within
 from jvr.types import ArrayLike, Scalar
 
 Tree = TypeVar("Tree")
@@ -21,7 +22,7 @@ class ByValue(eqx.Module):
     **Raises** `ValueError` for other shapes, positions that do not increase, values that are not finite.
     """
 
-    positions: Float[Array, "n"]
+    positions: Float[Array, "n"] = eqx.field(metadata=within(Increasing()))
     values: Float[Array, "n"]
 
     def __init__(self, positions: ArrayLike, values: ArrayLike):

@@ -10,10 +10,10 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model.checks import float_array, require
+from jvr.model.ranges import NOT_NEGATIVE, POSITIVE, Interval, within
 from jvr.types import ArrayLike, Scalar, Triple, Vector
 
 Numbers = Float[Array, "..."]
@@ -34,6 +34,9 @@ MEASURED = {
     "wholemilk": ((2.55, 3.21, 3.77), (0.0011, 0.0024, 0.014)),
 }
 
+# Index of refraction: the fit of F_dr is for light from the denser side, and reaches 1 at 4.9.
+REFRACTION = Interval(1.0, 3.0)
+
 
 class Dipole(eqx.Module):
     """Diffuse reflectance `R_d(r)` of a half space: the share of the light falling on a point that leaves at distance `r`, per area.
@@ -46,17 +49,17 @@ class Dipole(eqx.Module):
     `eta`: relative index of refraction, in [1, 3]. All differentiable. **Raises** `ValueError` otherwise.
     """
 
-    sigma_s_prime: Vector
-    sigma_a: Vector
-    eta: Scalar
+    sigma_s_prime: Vector = eqx.field(metadata=within(POSITIVE))
+    sigma_a: Vector = eqx.field(metadata=within(NOT_NEGATIVE))
+    eta: Scalar = eqx.field(metadata=within(REFRACTION))
 
     def __init__(self, sigma_s_prime: ArrayLike, sigma_a: ArrayLike, eta: ArrayLike = 1.3):
         self.sigma_s_prime = float_array(sigma_s_prime, "sigma_s_prime", (3,))
         self.sigma_a, self.eta = float_array(sigma_a, "sigma_a", (3,)), float_array(eta, "eta", ())
-        require(self.sigma_s_prime, lambda s: np.isfinite(s) & (s > 0), "sigma_s_prime must be finite and positive, in 1 / mm")
-        require(self.sigma_a, lambda s: np.isfinite(s) & (s >= 0), "sigma_a must be finite and not negative, in 1 / mm")
+        require(self.sigma_s_prime, POSITIVE.holds, "sigma_s_prime must be finite and positive, in 1 / mm")
+        require(self.sigma_a, NOT_NEGATIVE.holds, "sigma_a must be finite and not negative, in 1 / mm")
         # The fit of F_dr is for light from the denser side, and reaches 1 at 4.9.
-        require(self.eta, lambda e: (e >= 1) & (e <= 3), "eta, an index of refraction, must be in [1, 3]; skin has 1.3")
+        require(self.eta, REFRACTION.holds, "eta, an index of refraction, must be in [1, 3]; skin has 1.3")
 
     @classmethod
     def preset(cls, name: str) -> "Dipole":

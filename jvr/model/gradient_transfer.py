@@ -2,11 +2,13 @@
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import float_array, require
+from jvr.model.ranges import EXTINCTION, NOT_NEGATIVE, SHARE, Increasing, within
 from jvr.model.transfer import AbstractTransfer, Classified
 from jvr.types import ArrayLike, Channels, Scalar
 
@@ -22,10 +24,10 @@ class GradientTransfer(AbstractTransfer):
 
     takes_gradient: ClassVar[bool] = True
 
-    rgb: Float[Array, "n m 3"]
-    sigma_t: Float[Array, "..."]
-    domain: Float[Array, "2"]
-    magnitudes: Float[Array, "2"]
+    rgb: Float[Array, "n m 3"] = eqx.field(metadata=within(SHARE))
+    sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
+    domain: Float[Array, "2"] = eqx.field(metadata=within(Increasing()))
+    magnitudes: Float[Array, "2"] = eqx.field(metadata=within(Increasing()))
 
     def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike, magnitudes: ArrayLike):
         self.rgb = float_array(rgb, "rgb", (None, None, 3))
@@ -34,7 +36,7 @@ class GradientTransfer(AbstractTransfer):
             raise ValueError(f"a GradientTransfer needs at least 2 x 2 entries, not {n} x {m}")
         require(self.rgb, np.isfinite, "rgb must be finite")
         self.sigma_t = float_array(sigma_t, "sigma_t", (n, m), (n, m, 3))
-        require(self.sigma_t, lambda v: np.isfinite(v) & (v >= 0), "sigma_t must be finite and not negative")
+        require(self.sigma_t, EXTINCTION.holds, "sigma_t must be finite and not negative")
         increasing = lambda d: np.isfinite(d) & (d[0] < d[1])
         self.domain = float_array(domain, "domain", (2,))
         self.magnitudes = float_array(magnitudes, "magnitudes", (2,))
@@ -69,8 +71,8 @@ class GradientOpacity(AbstractTransfer):
     takes_gradient: ClassVar[bool] = True
 
     transfer: AbstractTransfer
-    low: Scalar
-    high: Scalar
+    low: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
+    high: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, transfer: AbstractTransfer, low: ArrayLike, high: ArrayLike):
         if not isinstance(transfer, AbstractTransfer) or transfer.takes_gradient:

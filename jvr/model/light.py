@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model.checks import float_array, require
+from jvr.model.ranges import DEGREES, NOT_NEGATIVE, POSITIVE, UnitVector, within
 from jvr.numerics import direction_and_length, dot
 from jvr.types import ArrayLike, Scalar, Triple, Vector
 
@@ -43,8 +44,8 @@ class DirectionalLight(AbstractLight):
     **Arguments:** `direction`: `(3,)`, the way the light travels, of any length but zero; `irradiance`: a number or `(3,)`, not negative.
     """
 
-    direction: Vector
-    irradiance: Float[Array, "..."]
+    direction: Vector = eqx.field(metadata=within(UnitVector()))
+    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, direction: ArrayLike, irradiance: ArrayLike = 1.0):
         self.direction = _direction(direction, "DirectionalLight")
@@ -64,9 +65,9 @@ class PointLight(AbstractLight):
     """
 
     position: Vector
-    intensity: Float[Array, "..."]
-    radius: Scalar
-    attenuation: Vector | None
+    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    radius: Scalar = eqx.field(metadata=within(POSITIVE))
+    attenuation: Vector | None = eqx.field(metadata=within(POSITIVE))
 
     def __init__(
         self,
@@ -80,7 +81,7 @@ class PointLight(AbstractLight):
         require(self.position, np.isfinite, "a light's position must be finite")
         self.intensity = _colour(intensity, "intensity")
         self.radius = float_array(radius, "radius", ())
-        require(self.radius, lambda r: np.isfinite(r) & (r > 0), "a light's radius must be positive: 1e-3 is a good start")
+        require(self.radius, POSITIVE.holds, "a light's radius must be positive: 1e-3 is a good start")
         self.attenuation = None if attenuation is None else _attenuation(attenuation)
 
     def arrives(self, x: Triple, w_o: Triple) -> Arrival:
@@ -98,12 +99,12 @@ class SpotLight(AbstractLight):
     """
 
     position: Vector
-    direction: Vector
-    intensity: Float[Array, "..."]
-    inner: Scalar
-    outer: Scalar
-    radius: Scalar
-    attenuation: Vector | None
+    direction: Vector = eqx.field(metadata=within(UnitVector()))
+    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    inner: Scalar = eqx.field(metadata=within(DEGREES))
+    outer: Scalar = eqx.field(metadata=within(DEGREES))
+    radius: Scalar = eqx.field(metadata=within(POSITIVE))
+    attenuation: Vector | None = eqx.field(metadata=within(POSITIVE))
 
     def __init__(
         self,
@@ -140,7 +141,7 @@ class HeadLight(AbstractLight):
 
     casts_shadows: ClassVar[bool] = False
 
-    irradiance: Float[Array, "..."]
+    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, irradiance: ArrayLike = 1.0):
         self.irradiance = _colour(irradiance, "irradiance")
@@ -152,7 +153,7 @@ class HeadLight(AbstractLight):
 class AmbientLight(eqx.Module):
     """The same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
 
-    radiance: Float[Array, "..."]
+    radiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, radiance: ArrayLike = 1.0):
         self.radiance = _colour(radiance, "radiance")
@@ -225,7 +226,7 @@ def _direction(value: ArrayLike, name: str) -> Vector:
 
 def _colour(value: ArrayLike, name: str) -> Float[Array, "..."]:
     colour = float_array(value, name, (), (3,))
-    require(colour, lambda c: np.isfinite(c) & (c >= 0), f"a light's {name} must be finite and not negative")
+    require(colour, NOT_NEGATIVE.holds, f"a light's {name} must be finite and not negative")
     return colour
 
 

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractMaterial
 from jvr.model.harmonics.basis import basis
+from jvr.model.ranges import NOT_NEGATIVE, Increasing, within
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 # The largest angle between the normal and the eye that materials are projected for.
@@ -57,8 +58,8 @@ class HarmonicMaterial(AbstractMaterial):
 
     tinted: Lobe | None
     plain: Lobe | None
-    positions: Float[Array, "classes"]
-    threshold: Scalar
+    positions: Float[Array, "classes"] = eqx.field(metadata=within(Increasing()))
+    threshold: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
 
     @classmethod
     def project(
@@ -73,7 +74,7 @@ class HarmonicMaterial(AbstractMaterial):
         if directions < 2 or nodes < 4:
             raise ValueError(f"a material needs at least 2 directions and 4 nodes, not {directions} and {nodes}")
         limit = float_array(threshold, "threshold", ())
-        require(limit, lambda t: np.isfinite(t) & (t >= 0), "threshold must be a length of the gradient, not negative")
+        require(limit, NOT_NEGATIVE.holds, "threshold must be a length of the gradient, not negative")
         # The last angle is just above the horizon, where in either precision the eye is above the surface.
         polar = np.array([0.0]) if brdf.about != "both" else np.minimum(np.linspace(0, math.pi / 2, directions), GRAZING)
         w_i, weights = half_sphere_nodes(nodes)
@@ -131,7 +132,7 @@ class MaterialByValue(AbstractMaterial):
     `projected` for orders or directions that differ; `TypeError` for anything else, such as another `MaterialByValue`.
     """
 
-    positions: Float[Array, "n"]
+    positions: Float[Array, "n"] = eqx.field(metadata=within(Increasing()))
     materials: tuple[AbstractMaterial, ...]
 
     def __init__(self, positions: ArrayLike, materials: Sequence[AbstractMaterial]):

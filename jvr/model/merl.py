@@ -10,13 +10,14 @@ import math
 import os
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jvr.model.brdf import above, of_one_shape, where_or_normal
 from jvr.model.checks import float_array, require
 from jvr.model.material import About, AbstractBRDF
+from jvr.model.ranges import NOT_NEGATIVE, within
 from jvr.numerics import direction_and_length, dot
 from jvr.types import ArrayLike, Channels, Triple
 
@@ -34,11 +35,11 @@ class MerlBRDF(AbstractBRDF):
     """
 
     about: ClassVar[About] = "both"
-    table: Float[Array, "theta_h theta_d phi_d 3"]
+    table: Float[Array, "theta_h theta_d phi_d 3"] = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, table: ArrayLike):
         self.table = float_array(table, "table", (None, None, None, 3))
-        require(self.table, lambda t: np.isfinite(t) & (t >= 0), "a table of reflectance must be finite and not negative")
+        require(self.table, NOT_NEGATIVE.holds, "a table of reflectance must be finite and not negative")
 
     @classmethod
     def read(cls, path: str | os.PathLike) -> "MerlBRDF":

@@ -9,6 +9,7 @@ with correlated heights (Heitz 2014, Understanding the masking-shadowing functio
 import math
 from typing import ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,12 +19,16 @@ from jvr.model.brdf import above, of_one_shape, share, where_or_normal
 from jvr.model.checks import float_array, require
 from jvr.model.material import About, AbstractBRDF
 from jvr.model.phase import components
+from jvr.model.ranges import SHARE, Interval, within
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 Numbers = Float[Array, "..."]
 # Angles of the table of reflectances, and mirrors down and around for each: errors of at most 0.001 at any roughness.
 _ANGLES, _DOWN, _AROUND = 64, 48, 16
+
+# Below, the peak of D and its derivatives leave float32.
+ROUGHNESS = Interval(0.001, 1.0)
 
 
 class MicrofacetBRDF(AbstractBRDF):
@@ -41,10 +46,10 @@ class MicrofacetBRDF(AbstractBRDF):
     """
 
     about: ClassVar[About] = "both"
-    base: Numbers
-    metallic: Scalar
-    roughness: Scalar
-    reflectance_at_normal: Numbers
+    base: Numbers = eqx.field(metadata=within(SHARE))
+    metallic: Scalar = eqx.field(metadata=within(SHARE))
+    roughness: Scalar = eqx.field(metadata=within(ROUGHNESS))
+    reflectance_at_normal: Numbers = eqx.field(metadata=within(SHARE))
 
     def __init__(
         self,

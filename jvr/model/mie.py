@@ -2,9 +2,9 @@
 
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jvr.model.by_value import ByValue
@@ -21,8 +21,12 @@ from jvr.model.phase import (
     magnitude,
     sample_henyey_greenstein,
 )
+from jvr.model.ranges import ASYMMETRY, NOT_NEGATIVE, Interval, within
 from jvr.numerics import divide_or_zero
 from jvr.types import ArrayLike, Channels, Scalar
+
+# Of droplets, in micrometres: what their fit was made for.
+DIAMETER = Interval(5.0, 50.0)
 
 
 class Draine(AbstractPhase):
@@ -34,12 +38,12 @@ class Draine(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    g: Numbers
-    alpha: Numbers
+    g: Numbers = eqx.field(metadata=within(ASYMMETRY))
+    alpha: Numbers = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, g: ArrayLike | ByValue, alpha: ArrayLike):
         self.g, self.alpha = asymmetry(g, "g"), float_array(alpha, "alpha", (), (3,))
-        require(self.alpha, lambda a: np.isfinite(a) & (a >= 0), "alpha must be finite and not negative")
+        require(self.alpha, NOT_NEGATIVE.holds, "alpha must be finite and not negative")
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return tuple(_draine(g, alpha, angle) for g, alpha in components(self.g, self.alpha))
@@ -60,11 +64,11 @@ class JendersieEon(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    diameter: Numbers
+    diameter: Numbers = eqx.field(metadata=within(DIAMETER))
 
     def __init__(self, diameter: ArrayLike):
         self.diameter = float_array(diameter, "diameter", (), (3,))
-        require(self.diameter, lambda d: (d >= 5) & (d <= 50), "diameter of the droplets must be in [5, 50] micrometres")
+        require(self.diameter, DIAMETER.holds, "diameter of the droplets must be in [5, 50] micrometres")
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         lobes = (_droplet_lobes(d) for (d,) in components(self.diameter))
@@ -95,7 +99,7 @@ class TabulatedPhase(AbstractPhase):
     """
 
     angles: Float[Array, "n"]
-    values: Numbers
+    values: Numbers = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, angles: ArrayLike, values: ArrayLike):
         self.angles = float_array(angles, "angles", (None,))
@@ -109,7 +113,7 @@ class TabulatedPhase(AbstractPhase):
             "angles must run from 0 to pi: convert degrees with numpy.deg2rad, repeat the nearest value where an end is missing",
         )
         self.values = float_array(values, "values", (n,), (n, 3))
-        require(self.values, lambda v: np.isfinite(v) & (v >= 0), "values must be finite and not negative")
+        require(self.values, NOT_NEGATIVE.holds, "values must be finite and not negative")
         require(jnp.max(self.values, axis=0), lambda v: v > 0, "values must not all be zero")
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:

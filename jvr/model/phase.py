@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from jvr.model.by_value import ByValue
 from jvr.model.checks import float_array, require
+from jvr.model.ranges import ASYMMETRY, NOT_NEGATIVE, SHARE, within
 from jvr.numerics import divide_or_zero
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
@@ -154,7 +155,7 @@ class HenyeyGreenstein(AbstractPhase):
     **Arguments:** `g`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either; differentiable. **Raises** `ValueError` otherwise.
     """
 
-    g: Numbers
+    g: Numbers = eqx.field(metadata=within(ASYMMETRY))
 
     def __init__(self, g: ArrayLike | ByValue):
         self.g = asymmetry(g, "g")
@@ -177,14 +178,14 @@ class DoubleHenyeyGreenstein(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    g1: Numbers
-    g2: Numbers
-    weight: Numbers
+    g1: Numbers = eqx.field(metadata=within(ASYMMETRY))
+    g2: Numbers = eqx.field(metadata=within(ASYMMETRY))
+    weight: Numbers = eqx.field(metadata=within(SHARE))
 
     def __init__(self, g1: ArrayLike | ByValue, g2: ArrayLike | ByValue, weight: ArrayLike):
         self.g1, self.g2 = asymmetry(g1, "g1"), asymmetry(g2, "g2")
         self.weight = float_array(weight, "weight", (), (3,))
-        require(self.weight, lambda w: (w >= 0) & (w <= 1), "weight, of the first lobe, must be in [0, 1]")
+        require(self.weight, SHARE.holds, "weight, of the first lobe, must be in [0, 1]")
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return tuple(
@@ -215,7 +216,7 @@ class Schlick(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    k: Numbers
+    k: Numbers = eqx.field(metadata=within(ASYMMETRY))
 
     def __init__(self, k: ArrayLike | ByValue):
         self.k = asymmetry(k, "k")
@@ -239,7 +240,7 @@ class Mixture(AbstractPhase):
     """
 
     phases: tuple[AbstractPhase, ...]
-    weights: Numbers
+    weights: Numbers = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, phases: Sequence[AbstractPhase], weights: ArrayLike):
         self.phases = tuple(phases)
@@ -287,7 +288,7 @@ class Mixture(AbstractPhase):
 def asymmetry(value: ArrayLike | ByValue, name: str) -> Any:
     """One number or three, or one by value, of magnitude below 1."""
     array = value.values if isinstance(value, ByValue) else float_array(value, name, (), (3,))
-    require(array, lambda g: np.abs(g) < 1, f"{name} must lie between -1 and 1 without either, such as 0.9999")
+    require(array, ASYMMETRY.holds, f"{name} must lie between -1 and 1 without either, such as 0.9999")
     return value if isinstance(value, ByValue) else array
 
 

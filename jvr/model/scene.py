@@ -10,6 +10,7 @@ from jvr.model.environment import EnvironmentLight
 from jvr.model.light import AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
+from jvr.model.ranges import SHARE, within
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import ClippingBox, Volume
 from jvr.types import ArrayLike, Vector
@@ -43,7 +44,7 @@ class Scene(eqx.Module):
 
     volume: Volume
     transfer: AbstractTransfer
-    background: Vector | None
+    background: Vector | None = eqx.field(metadata=within(SHARE))
     optical: AbstractOpticalModel
     clipping: ClippingBox | None
     lights: tuple[AbstractLight | AmbientLight, ...]

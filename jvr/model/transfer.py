@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import float_array, require
+from jvr.model.ranges import EXTINCTION, POSITIVE, SHARE, Increasing, within
 from jvr.numerics import divide_or_zero, read_run
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
@@ -63,9 +64,9 @@ class LinearTransfer(AbstractTable):
     **Raises** `ValueError` for other shapes, positions that do not increase, negative or non-finite values.
     """
 
-    positions: Float[Array, "n"]
-    rgb: Float[Array, "n 3"]
-    sigma_t: Float[Array, "..."]
+    positions: Float[Array, "n"] = eqx.field(metadata=within(Increasing()))
+    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(SHARE))
+    sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
 
     def __init__(self, positions: ArrayLike, rgb: ArrayLike, sigma_t: ArrayLike):
         self.positions = float_array(positions, "positions", (None,))
@@ -98,9 +99,9 @@ class LutTransfer(AbstractTable):
     differentiable. **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
     """
 
-    rgb: Float[Array, "n 3"]
-    sigma_t: Float[Array, "..."]
-    domain: Float[Array, "2"]
+    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(SHARE))
+    sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
+    domain: Float[Array, "2"] = eqx.field(metadata=within(Increasing()))
 
     def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike):
         rgb = float_array(rgb, "rgb", (None, 3))
@@ -135,9 +136,9 @@ class GaussianTransfer(AbstractTransfer):
     """
 
     center: Float[Array, "g"]
-    width: Float[Array, "g"]
-    height: Float[Array, "..."]
-    rgb: Float[Array, "g 3"]
+    width: Float[Array, "g"] = eqx.field(metadata=within(POSITIVE))
+    height: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
+    rgb: Float[Array, "g 3"] = eqx.field(metadata=within(SHARE))
 
     def __init__(self, center: ArrayLike, width: ArrayLike, height: ArrayLike, rgb: ArrayLike):
         self.center = float_array(center, "center", (None,))
@@ -146,7 +147,7 @@ class GaussianTransfer(AbstractTransfer):
             raise ValueError("GaussianTransfer needs at least one Gaussian")
         self.width = float_array(width, "width", (g,))
         require(self.center, np.isfinite, "center must be finite")
-        require(self.width, lambda w: np.isfinite(w) & (w > 0), "width must be positive")
+        require(self.width, POSITIVE.holds, "width must be positive")
         self.height, self.rgb = _extinction(height, g, "height"), _colour(rgb, g)
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
@@ -179,7 +180,7 @@ def _colour(rgb: ArrayLike, n: int) -> Float[Array, "n 3"]:
 
 def _extinction(sigma_t: ArrayLike, n: int, name: str = "sigma_t") -> Float[Array, "..."]:
     sigma_t = float_array(sigma_t, name, (n,), (n, 3))
-    require(sigma_t, lambda v: np.isfinite(v) & (v >= 0), f"{name} must be finite and not negative")
+    require(sigma_t, EXTINCTION.holds, f"{name} must be finite and not negative")
     return sigma_t
 
 

@@ -237,7 +237,8 @@ def _solver(fit: FitTable) -> Any:
     import optax
     import optimistix as optx
 
-    from jvr.fitting.solvers import LBFGSB, Dogleg, GaussNewton, LevenbergMarquardt
+    from jvr.fitting.least_squares import Dogleg, GaussNewton, LevenbergMarquardt
+    from jvr.fitting.minimisers import LBFGSB
 
     chunked = {"levenberg-marquardt": LevenbergMarquardt, "gauss-newton": GaussNewton, "dogleg": Dogleg}
     if fit.solver in chunked:

@@ -20,6 +20,7 @@ def verdict(result: "FitResult", targets: Sequence[Any], fitted: Sequence[Any]) 
     ended = {
         Outcome.CONVERGED: "The fit converged",
         Outcome.STEP_LIMIT: "The fit reached its limit of iterations before it converged",
+        Outcome.STALLED: "The fit stalled before it converged: no step made the pictures any better",
         Outcome.NON_FINITE: "The fit met a value that is not finite and kept its last good state",
         Outcome.INTERRUPTED: "The fit was interrupted and kept its last good state",
     }[result.outcome]

@@ -1,0 +1,159 @@
+"""Minimisers of other libraries, driven one step at a time: Optimistix's own through their `init` and `step`, and a bounded one by
+jaxopt."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from jvr.fitting.solvers import AbstractSolver, Functions
+from jvr.model.ranges import Interval
+from jvr.types import Outcome
+
+
+class Scaled(eqx.Module):
+    """An objective times a factor. Quasi-Newton methods leave out updates whose curvature is under the rounding of float32, which a
+    mean over pixels starts out with; scaled by `unknowns / objective` at the start, a step of one changes it by about itself."""
+
+    function: Any
+    factor: Array
+
+    def __call__(self, real: Float[Array, "n"], args: None) -> tuple[Array, None]:
+        loss, aux = self.function(real, args)
+        return loss * self.factor, aux
+
+
+@eqx.filter_jit
+def _factor(function: Any, real: Array) -> Array:
+    loss, _ = function(real, None)
+    return jnp.where(loss > 0, real.size / jnp.where(loss > 0, loss, 1.0), 1.0)
+
+
+class GradientState(NamedTuple):
+    """`inner` is the other library's state; `best` and `best_loss` the best point it has accepted; `factor` that of `Scaled`."""
+
+    real: Array
+    inner: Any
+    best: Array
+    best_loss: Array
+    factor: Array
+    done: Array
+
+
+class AbstractGradientSolver(AbstractSolver):
+    """A solver of another library; keeps the best point that it has accepted."""
+
+    def iterate(self, state: GradientState) -> tuple[np.ndarray, float]:
+        return np.asarray(state.best), float(state.best_loss / state.factor)
+
+    def outcome(self, state: GradientState) -> Outcome | None:
+        return (None, Outcome.CONVERGED, Outcome.NON_FINITE)[int(state.done)]
+
+
+def _moved(state: GradientState, real: Array, inner: Any, here: Array, loss: Array, finished: Array) -> GradientState:
+    """The state after a step that ended at `real` and knows the objective `loss` at `here`."""
+    finite = jnp.all(jnp.isfinite(real)) & jnp.isfinite(loss)
+    better = finite & (loss < state.best_loss)
+    best, best_loss = jnp.where(better, here, state.best), jnp.where(better, loss, state.best_loss)
+    return GradientState(real, inner, best, best_loss, state.factor, jnp.where(finite, finished.astype(int), 2))
+
+
+def _begin(real: Array, inner: Any, factor: Array) -> GradientState:
+    return GradientState(real, inner, real, jnp.asarray(jnp.inf, real.dtype), factor, jnp.asarray(0))
+
+
+class OptimistixSolver(AbstractGradientSolver):
+    """Drives a minimiser of Optimistix (BFGS, LBFGS, OptaxMinimiser, ...) over the value, or a least-squares solver over the whole
+    residual vector, which must then fit in memory, times the number of unknowns."""
+
+    solver: optx.AbstractMinimiser | optx.AbstractLeastSquaresSolver
+
+    def init(self, functions: Functions, real: Float[Array, "n"]) -> GradientState:
+        whole = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
+        factor = jnp.ones(()) if whole else _factor(functions.value, real)
+        return _begin(real, _init(self.solver, self._function(functions, factor), real), factor)
+
+    def step(self, functions: Functions, state: GradientState) -> GradientState:
+        return _step(self.solver, self._function(functions, state.factor), state)
+
+    @property
+    def bounds(self) -> None:
+        return None
+
+    def _function(self, functions: Functions, factor: Array) -> Callable[..., Any]:
+        whole = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
+        return functions.residuals if whole else Scaled(functions.value, factor)
+
+
+@eqx.filter_jit
+def _init(solver: Any, fn: Any, real: Array) -> Any:
+    shape, aux = eqx.filter_eval_shape(fn, real, None)
+    return solver.init(fn, real, None, {}, shape, aux, frozenset())
+
+
+@eqx.filter_jit
+def _step(solver: Any, fn: Any, state: GradientState) -> GradientState:
+    real, inner, _ = solver.step(fn, state.real, None, {}, state.inner, frozenset())
+    finished, _ = solver.terminate(fn, real, None, {}, inner, frozenset())
+    if isinstance(solver, optx.OptaxMinimiser):
+        # Optax moves on from the point that it has just evaluated; the others return the point that they have accepted.
+        return _moved(state, real, inner, state.real, inner.f, finished)
+    # Least-squares solvers minimise half the squared length.
+    half = isinstance(solver, optx.AbstractLeastSquaresSolver)
+    return _moved(state, real, inner, real, inner.f_info.as_min() * (2 if half else 1), finished)
+
+
+class LBFGSB(AbstractGradientSolver):
+    """Limited-memory BFGS with bounds (Byrd et al. 1995), by jaxopt, over the values themselves within the ranges that they declare.
+
+    **Arguments:** `lower`, `upper`: narrower bounds for all unknowns alike but directions and positions (`jvr.Bounded` among the
+    `transforms` of a fit bounds one of them); `tol`: of the projected gradient; `history`: corrections kept. jaxopt is unmaintained and is
+    used nowhere else.
+    """
+
+    lower: float = eqx.field(static=True, default=-np.inf)
+    upper: float = eqx.field(static=True, default=np.inf)
+    tol: float = eqx.field(static=True, default=1e-6)
+    history: int = eqx.field(static=True, default=10)
+
+    def init(self, functions: Functions, real: Float[Array, "n"]) -> GradientState:
+        bounds = _bounds(functions, real)
+        real = jnp.clip(real, *bounds)
+        factor = _factor(functions.value, real)
+        return _begin(real, _bounded_init(self.tol, self.history, Scaled(functions.value, factor), real, bounds), factor)
+
+    def step(self, functions: Functions, state: GradientState) -> GradientState:
+        return _bounded_step(self.tol, self.history, Scaled(functions.value, state.factor), state, _bounds(functions, state.real))
+
+    @property
+    def bounds(self) -> Interval:
+        return Interval(self.lower, self.upper)
+
+
+def _bounds(functions: Functions, real: Array) -> tuple[Array, Array]:
+    limits = functions.limits(np.asarray(real))
+    return jnp.asarray(limits.lower, real.dtype), jnp.asarray(limits.upper, real.dtype)
+
+
+def _jaxopt_solver(tol: float, history: int, fn: Any) -> Any:
+    with warnings.catch_warnings():
+        # jaxopt announces on import that it is no longer maintained; users of one bounded fit cannot act on that.
+        warnings.simplefilter("ignore")
+        import jaxopt
+    return jaxopt.LBFGSB(lambda real: fn(real, None)[0], tol=tol, history_size=history)
+
+
+@eqx.filter_jit
+def _bounded_init(tol: float, history: int, fn: Any, real: Array, bounds: tuple[Array, Array]) -> Any:
+    return _jaxopt_solver(tol, history, fn).init_state(real, bounds)
+
+
+@eqx.filter_jit
+def _bounded_step(tol: float, history: int, fn: Any, state: GradientState, bounds: tuple[Array, Array]) -> GradientState:
+    real, inner = _jaxopt_solver(tol, history, fn).update(state.real, state.inner, bounds)
+    return _moved(state, real, inner, real, inner.value, inner.error <= tol)

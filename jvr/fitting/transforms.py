@@ -1,0 +1,219 @@
+"""How unknowns live on the real line while they are fitted.
+
+A solver moves a vector of real numbers. Solvers that keep to bounds move the values themselves between the ends of their ranges; others
+need a smooth map from the whole real line into the range.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jvr.model.ranges import Increasing, Interval, Range, UnitVector
+from jvr.numerics import normalise
+
+# How near to the end of its range a start value may lie: at the end itself a smooth map has no slope and the fit cannot leave.
+MARGIN = 1e-3
+# What is positive, or a gap between positions, stays above this share of its scale.
+LEAST = 1e-6
+
+Bounds = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
+
+
+class AbstractTransform(eqx.Module):
+    """A map from real numbers, within bounds, onto the values that an unknown may take."""
+
+    @abc.abstractmethod
+    def forward(self, real: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The value."""
+
+    @abc.abstractmethod
+    def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The real number that gives `value`, or the nearest value that has one."""
+
+    @abc.abstractmethod
+    def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
+        """The least and the largest real number for each of `real`."""
+
+    @abc.abstractmethod
+    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """How far from each of `real` a linearisation of the pictures may be good for."""
+
+
+def _unbounded(real: Float[np.ndarray, "..."]) -> Bounds:
+    return np.full(real.shape, -np.inf), np.full(real.shape, np.inf)
+
+
+class Identity(AbstractTransform):
+    """Any real value."""
+
+    def forward(self, real: Float[Array, "..."]) -> Float[Array, "..."]:
+        return real
+
+    def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        return value
+
+    def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
+        return _unbounded(real)
+
+    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        return np.full(real.shape, np.inf)
+
+
+class Bounded(AbstractTransform):
+    """The value itself between `low` and `high`, for solvers that keep to bounds; in units of `scale`, a typical value."""
+
+    low: float = eqx.field(static=True, default=0.0)
+    high: float = eqx.field(static=True, default=1.0)
+    scale: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+
+    def forward(self, real: Float[Array, "..."]) -> Float[Array, "..."]:
+        value = self.scale * real
+        # The product may be rounded out of its range; an unknown at its bound keeps its slope, so that it can leave.
+        return value + jax.lax.stop_gradient(jnp.clip(value, self.low, self.high) - value)
+
+    def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        return jnp.clip(value, self.low, self.high) / self.scale
+
+    def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
+        ends = (np.full(real.shape, end / float(self.scale)) for end in (self.low, self.high))
+        return next(ends), next(ends)
+
+    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        # What is bounded on one side acts by its logarithm, as extinctions do: a linearisation is good for a few times the value.
+        one_sided = np.isfinite(self.low) and not np.isfinite(self.high)
+        return 0.1 + 2 * np.abs(real) if one_sided else np.full(real.shape, np.inf)
+
+
+# Within this distance the curved transforms change their slope by less than an order of magnitude.
+REACH = 2.0
+
+
+class Softplus(AbstractTransform):
+    """Values above `low`, `low + scale * log(1 + exp(x))`; `scale` is a typical distance from it, in the unknown's own unit."""
+
+    scale: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+    low: float = eqx.field(static=True, default=0.0)
+
+    def forward(self, real: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self.low + self.scale * jax.nn.softplus(real)
+
+    def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        ratio = jnp.maximum((value - self.low) / self.scale, MARGIN)
+        return ratio + jnp.log(-jnp.expm1(-ratio))
+
+    def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
+        return _unbounded(real)
+
+    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        return np.full(real.shape, REACH)
+
+
+class Sigmoid(AbstractTransform):
+    """Values between `low` and `high`."""
+
+    low: float = eqx.field(static=True, default=0.0)
+    high: float = eqx.field(static=True, default=1.0)
+
+    def forward(self, real: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self.low + (self.high - self.low) * jax.nn.sigmoid(real)
+
+    def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        share = jnp.clip((value - self.low) / (self.high - self.low), MARGIN, 1 - MARGIN)
+        return jnp.log(share) - jnp.log1p(-share)
+
+    def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
+        return _unbounded(real)
+
+    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        return np.full(real.shape, REACH)
+
+
+class Direction(AbstractTransform):
+    """Unit vectors: what has no length to be found."""
+
+    def forward(self, real: Float[Array, "3"]) -> Float[Array, "3"]:
+        return normalise(real)
+
+    def inverse(self, value: Float[Array, "3"]) -> Float[Array, "3"]:
+        return normalise(value)
+
+    def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
+        return _unbounded(real)
+
+    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        # About 30 degrees.
+        return np.full(real.shape, 0.5)
+
+
+class Ordered(AbstractTransform):
+    """Strictly increasing values with both ends free: the first as it is, then softplus of every gap over the mean gap."""
+
+    scale: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+
+    def forward(self, real: Float[Array, "n"]) -> Float[Array, "n"]:
+        gaps = self.scale * jax.nn.softplus(real[1:])
+        return jnp.concatenate([self.scale * real[:1], self.scale * real[0] + jnp.cumsum(gaps)])
+
+    def inverse(self, value: Float[Array, "n"]) -> Float[Array, "n"]:
+        gaps = Softplus(self.scale).inverse(jnp.diff(value))
+        return jnp.concatenate([value[:1] / self.scale, gaps])
+
+    def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
+        return _unbounded(real)
+
+    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        return np.full(real.shape, REACH)
+
+
+class Gaps(AbstractTransform):
+    """Strictly increasing values for solvers that keep to bounds: the first, then every gap, in units of the mean gap `scale`."""
+
+    scale: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+
+    def forward(self, real: Float[Array, "n"]) -> Float[Array, "n"]:
+        return self.scale * jnp.cumsum(real)
+
+    def inverse(self, value: Float[Array, "n"]) -> Float[Array, "n"]:
+        return jnp.concatenate([value[:1], jnp.diff(value)]) / self.scale
+
+    def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
+        low, high = _unbounded(real)
+        low[1:] = MARGIN
+        return low, high
+
+    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        return np.full(real.shape, 0.5)
+
+
+def transform_of(
+    within: Range, value: Float[Array, "..."], voxel: Float[Array, ""], bounds: Interval | None
+) -> AbstractTransform:
+    """The map for an unknown of a declared range: of its values within the range and `bounds`, or with `None` a smooth one from the whole
+    real line into the range.
+
+    `voxel`: the smallest spacing of the volume, by which typical extinctions are known.
+    """
+    if isinstance(within, UnitVector):
+        return Direction()
+    if isinstance(within, Increasing):
+        scale = jnp.mean(jnp.diff(value))
+        return Ordered(scale) if bounds is None else Gaps(scale)
+    low, high = within.low, within.high
+    if not np.isfinite(low):
+        scale = jnp.ones(())
+    elif np.isfinite(high):
+        scale = jnp.asarray(high - low)
+    else:
+        scale = 1.0 / voxel if within.per_length else jnp.maximum(jnp.mean(jnp.abs(value - low)), MARGIN)
+    if within.is_open:
+        inset = LEAST * float(scale)
+        low, high = low + inset, high - inset
+    if bounds is not None:
+        return Bounded(max(low, bounds.low), min(high, bounds.high), scale)
+    if np.isfinite(high):
+        return Sigmoid(low, high)
+    return Softplus(scale, low) if np.isfinite(low) else Identity()

@@ -1,0 +1,71 @@
+"""The values that a parameter may take, declared once beside its field: constructors check them and a fit keeps to them."""
+
+import dataclasses
+import math
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Interval:
+    """Numbers from `low` to `high`, the ends included unless `is_open`; `per_length`: in units of 1 / world length."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    is_open: bool = False
+    per_length: bool = False
+
+    @property
+    def closed(self) -> "Interval":
+        """The same with its ends."""
+        return dataclasses.replace(self, is_open=False)
+
+    def holds(self, values: Any) -> Any:
+        """Which values are finite and in the interval."""
+        inside = (self.low < values) & (values < self.high) if self.is_open else (self.low <= values) & (values <= self.high)
+        return np.isfinite(values) & inside
+
+    def __str__(self) -> str:
+        ends = f"{self.low:g} ... {self.high:g}"
+        return f"{ends}, without either end" if self.is_open else ends
+
+
+@dataclasses.dataclass(frozen=True)
+class UnitVector:
+    """Directions: their length says nothing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Increasing:
+    """Strictly increasing numbers."""
+
+
+Range: TypeAlias = Interval | UnitVector | Increasing
+
+ANY = Interval()
+NOT_NEGATIVE = Interval(low=0.0)
+POSITIVE = Interval(low=0.0, is_open=True)
+SHARE = Interval(0.0, 1.0)
+ASYMMETRY = Interval(-1.0, 1.0, is_open=True)
+EXTINCTION = Interval(low=0.0, per_length=True)
+DEGREES = Interval(0.0, 180.0)
+
+
+def within(declared: Range) -> dict[str, Range]:
+    """The metadata of a field whose array takes values in a range: `eqx.field(metadata=within(SHARE))`."""
+    return {"range": declared}
+
+
+def range_at(tree: Any, path: tuple[Any, ...]) -> Range:
+    """The range of the leaf of `tree` at a path of `jax.tree_util`: the innermost that is declared along it, such as that of an
+    asymmetry for the values of a `jvr.ByValue` in its place, and any number where none is."""
+    found: Range = ANY
+    for key in path:
+        if isinstance(key, jax.tree_util.GetAttrKey):
+            declared = {f.name: f.metadata.get("range") for f in dataclasses.fields(tree)}
+            found, tree = declared.get(key.name) or found, getattr(tree, key.name)
+        else:
+            tree = tree[key.key if isinstance(key, jax.tree_util.DictKey) else key.idx]
+    return found
