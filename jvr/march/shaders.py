@@ -25,6 +25,9 @@ class GradientFrame(eqx.Module):
     def in_world(self, transfer: Any, sample: Sample, point: Point) -> Sample:
         """The sample with its gradient per world length, along the world's axes."""
         along = self.normals.gradient(transfer, self.shape, point.p, (sample.s, sample.gradient, sample.neighbours))
+        # The largest numbers, by which files mark what has no data, would overflow.
+        largest = jnp.finfo(sample.s.dtype).max / 1024
+        along = tuple(jnp.clip(g, -largest, largest) for g in along)
         world = tuple(sum((self.axes_inverse[j, i] * along[j] for j in range(3)), jnp.zeros_like(sample.s)) for i in range(3))
         return sample._replace(gradient=world, neighbours=())
 
