@@ -76,3 +76,49 @@ def test_derivatives_of_a_cut_through_a_translucent_medium(x64):
     expected = (np.asarray(value(p + h)) - np.asarray(value(p - h))) / 2e-6
     np.testing.assert_allclose(gradient, expected, atol=1e-5 * np.abs(expected).max())
     assert np.abs(gradient).min() > 1e-4
+
+
+def ball(radius=10.0, size=28):
+    """A ball of label 2 in label 0, its centre, and the world positions of voxels."""
+    center = (size - 1) / 2 + np.array([0.2, -0.1, 0.3])
+    x = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), -1)
+    return np.where(np.linalg.norm(x - center, axis=-1) <= radius, 2, 0).astype(np.uint8), center
+
+
+def test_a_ball_of_labels_is_lit_as_a_ball():
+    """Against Lambert's law of the sphere itself, within nine tenths of its outline."""
+    values, center = ball()
+    transfer = jvr.LutTransfer(np.ones((3, 3)), [0.0, 9.0, 9.0], [0.0, 2.0])
+    volume = jvr.Volume(values, interpolation=jvr.Nearest())
+    scene = jvr.Scene(volume, transfer, lights=(jvr.DirectionalLight(LIGHT),), shading=jvr.Lambert(0.0))
+    camera = jvr.OrthographicCamera.look_at(center + np.array([40.0, 0, 0]), center, [0, 0, 1], 20.0, 32, 32)
+    image = np.asarray(render_quickly(scene, camera, jvr.Settings(0.25)).rgb[..., 0])
+    y = (np.arange(32) + 0.5 - 16) / 32 * 2
+    y, z = y, -y[:, None]
+    across = y**2 + z**2
+    normal = [np.sqrt(np.maximum(1 - across, 0)), y, z]
+    expected = np.maximum(-sum(n * w for n, w in zip(normal, LIGHT, strict=True)), 0)
+    seen = across < 0.81
+    error = np.abs(image - expected)[seen]
+    assert error.mean() < 0.03
+    assert np.percentile(error, 95) < 0.08
+    # Not that there were nothing to see.
+    assert expected[seen].std() > 0.2
+
+
+def test_labels_are_shaded_by_what_is_seen(x64):
+    """Derivatives in the extinctions of labels, through their normals, by replay against central differences."""
+    values = ball(2.6, 7)[0] + (np.arange(7) > 3).astype(np.uint8)
+    volume = jvr.Volume(values, interpolation=jvr.Nearest())
+    camera = jvr.PerspectiveCamera.look_at([15.0, 12, 14], [3, 3, 3], [0, 0, 1], 25.0, 4, 3)
+    weight = 0.5 + 0.3 * np.sin(np.arange(36)).reshape(3, 4, 3)
+
+    def loss(sigma_t):
+        transfer = jvr.LutTransfer(np.linspace(0.2, 1, 12).reshape(4, 3), sigma_t, [0.0, 3.0])
+        scene = jvr.Scene(volume, transfer, lights=(jvr.DirectionalLight(LIGHT),), shading=jvr.Lambert(0.1))
+        return jnp.sum(weight * jvr.render(scene, camera, jvr.Settings(0.5, termination=0)).rgb)
+
+    sigma_t, h = jnp.asarray([0.05, 0.3, 0.2, 0.6]), 1e-6 * np.eye(4)
+    value = compiled(lambda points: jax.lax.map(loss, points))
+    expected = (np.asarray(value(sigma_t + h)) - np.asarray(value(sigma_t - h))) / 2e-6
+    np.testing.assert_allclose(compiled(jax.grad(loss))(sigma_t), expected, atol=1e-6 * np.abs(expected).max())
