@@ -13,6 +13,7 @@ import jvr
 from jvr.march.compact import for_each, map_selected, write
 from jvr.march.oracle import distance_field, envelope
 from jvr.march.slices import SliceOptions, slice_level, synthesise
+from jvr.model.exact import Remainder
 from jvr.rendering.adaptive import render_slices
 
 render = compiled(jvr.render)
@@ -434,8 +435,9 @@ class Fisheye(jvr.model.camera.AbstractCamera):
     world_from_camera: jax.Array
     width: int
     height: int
+    remainder: Remainder
 
-    def rays(self, pixels):
+    def rays_ahead(self, pixels, ahead):
         raise NotImplementedError
 
 
@@ -443,7 +445,7 @@ class Fisheye(jvr.model.camera.AbstractCamera):
 def test_what_cannot_be_rendered_is_refused(sampling):
     s = scene()
     with pytest.raises(ValueError, match=r"not a Fisheye: leave Settings"):
-        jvr.render(s, Fisheye(jnp.eye(4), 4, 3), sampled(sampling))
+        jvr.render(s, Fisheye(jnp.eye(4), 4, 3, Remainder.left(jnp.eye(4), jnp.eye(4))), sampled(sampling))
     images = [np.zeros((3, 4, 3))]
     with pytest.raises(ValueError, match=r"every sample of every ray: leave Settings\(sampling=...\) at jvr.Uniform\(\)"):
         jvr.fit(s, [view(s, 4, 3)], images, settings=sampled(sampling), unknowns=lambda s: s.transfer.sigma_t)

@@ -268,3 +268,69 @@ def test_entries_deep_behind_an_opaque_front_keep_their_digits(depth):
             g, t = (x[name][OUTPUTS.index(output)] for x in (gradient, true))
             counted = np.abs(t) >= 1e-8 * np.abs(t).max()
             np.testing.assert_allclose(g[counted], t[counted], rtol=1e-4, err_msg=f"d {output} / d {name}")
+
+
+@compiled
+def _scene_gradient(inputs, rest):
+    return jax.value_and_grad(lambda i: jnp.sum(jvr.render(*eqx.combine(i, rest), SETTINGS).rgb))(inputs)
+
+
+def scene_gradient(scene, camera):
+    """The sum of a picture, and its derivative in everything."""
+    inputs, rest = eqx.partition((scene, camera), eqx.is_inexact_array)
+    total, gradient = jax.tree.map(np.asarray, _scene_gradient(inputs, rest))
+    return total, {jax.tree_util.keystr(path): x for path, x in jax.tree_util.tree_leaves_with_path(gradient)}
+
+
+def test_a_voxel_that_is_not_a_number_is_seen_by_the_rays_that_meet_it_alone():
+    """Those that miss the volume read voxel (0, 0, 0) all the same. The box keeps all others away from it: nothing may change."""
+    values = voxels((6, 6, 6))
+    clean, values[0, 0, 0] = values.copy(), np.nan
+    camera = look([20, 22, 25], [2, 2, 2], fov_y=22.0)
+    box = jvr.ClippingBox([1.2, 1.2, 1.2], [9, 9, 9])
+    make = lambda values: jvr.Scene(jvr.Volume(values), linear_transfer(), background=BACKGROUND, clipping=box)
+    (total, gradient), (expected, of_clean) = (scene_gradient(make(v), camera) for v in (values, clean))
+    assert 0 < (np.asarray(jvr.render(make(clean), camera, SETTINGS).alpha) == 0).sum() < 30
+    assert total == expected
+    for name, g in of_clean.items():
+        np.testing.assert_array_equal(gradient[name], g, err_msg=name)
+
+
+def test_the_largest_number_marks_what_has_no_data():
+    """As any number far below the transfer function does; under light, with voxels half a world length apart."""
+    camera = look([9, 10, 11], [2, 2, 2], fov_y=30.0)
+    light = {"lights": (jvr.DirectionalLight([-1.0, -0.5, -0.7]),), "shading": jvr.Lambert(threshold=0.1)}
+
+    def make(nothing):
+        values = voxels((8, 8, 8))
+        values[4:] = nothing
+        return jvr.Scene(jvr.Volume(values, affine((0.5, 0.5, 0.5))), linear_transfer(), background=BACKGROUND, **light)
+
+    (total, gradient), (expected, of_finite) = (scene_gradient(make(nothing), camera) for nothing in (-3.4e38, -1e9))
+    np.testing.assert_allclose(total, expected, rtol=1e-6)
+    for name, g in of_finite.items():
+        assert np.isfinite(gradient[name]).all(), name
+        if "transfer" in name or "lights" in name or "shading" in name:
+            np.testing.assert_allclose(gradient[name], g, atol=1e-5 * np.abs(g).max(), err_msg=name)
+
+
+@pytest.mark.parametrize("outer", [1e-10, 1e-4, 0.01, 30.0])
+def test_narrow_spots(outer):
+    """Light half-way between axis and edge, against the same numbers in double precision, with derivatives by central differences there."""
+
+    def arriving(p):
+        light = jvr.SpotLight(p[:3], [0.0, 0.0, 2.0], 3.0, inner=0.2 * p[3], outer=p[3])
+        zero = jnp.zeros_like(p[0])
+        x = (zero + 0.5 * np.tan(np.deg2rad(outer)), zero, zero + 1.0)
+        return light.arrives(x, (zero, zero, zero + 1)).irradiance[0]
+
+    p = np.array([0, 0, 0, outer])
+    value, gradient = jax.value_and_grad(arriving)(jnp.asarray(p, jnp.float32))
+    with jax.enable_x64(True):
+        h = 1e-5 * outer * np.diag([np.pi / 180, np.pi / 180, 1, 1])
+        expected = float(arriving(jnp.asarray(p)))
+        slopes = [float(arriving(jnp.asarray(p + e)) - arriving(jnp.asarray(p - e))) / (2 * e.max()) for e in h]
+    np.testing.assert_allclose(value, expected, rtol=1e-4)
+    assert 0.5 < expected < 2.9
+    # Along the axis there is less to see than across it.
+    np.testing.assert_allclose(gradient, slopes, atol=1e-3 * np.abs(slopes).max())

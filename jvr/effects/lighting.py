@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jvr.effects.cut import CutFaces
 from jvr.march.shaders import OpticalShader, PreIntegratedShader
 from jvr.march.steps import Point, Sample
 from jvr.model.by_value import at_value
@@ -31,6 +32,7 @@ class LitShader(OpticalShader):
     ambient: tuple[AmbientLight, ...]
     shading: AbstractShading | None
     scattering: AbstractScattering | None
+    cut: CutFaces | None = None  # where surfaces are clipped
     natural: Any = None  # a `jvr.effects.natural_light.NaturalLight`, where there is light from all around
 
     def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
@@ -45,7 +47,9 @@ class LitShader(OpticalShader):
         w_o, _ = direction_and_length(turned(-self.world_from_grid[:3, :3], point.direction))
         shading, scattering = at_value((self.shading, self.scattering), sample.s)
         normal, magnitude = direction_and_length(tuple(-g for g in sample.gradient)) if sample.gradient else ((zero,) * 3, zero)
+        normal, cut = (normal, zero) if self.cut is None else self.cut.normal(x, normal)
         surface = zero if shading is None else shading.surface_share(magnitude)
+        surface = surface + cut * (1 - surface)
         scatters = zero + 1 if scattering is None or not scattering.needs_gradient else scattering.share(magnitude)
         # Where there is a switch, what is not a surface scatters and does not reflect.
         reflects = 1 - scatters if scattering is not None and scattering.needs_gradient else zero + 1
@@ -72,7 +76,7 @@ class LitShader(OpticalShader):
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
         if self.natural is not None:
             around = arrives[len(self.lights)] if len(arrives) > len(self.lights) else ()
-            tinted, plain = self.natural.reflect(sample.s, magnitude, normal, w_o, around)
+            tinted, plain = self.natural.reflect(sample.s, magnitude, normal, w_o, around, cut)
             factor = [f + reflects * c for f, c in zip(factor, tinted, strict=True)]
             added = [b + reflects * c for b, c in zip(added, plain, strict=True)]
         return tuple(factor), tuple(added)

@@ -86,13 +86,16 @@ class NaturalLight(eqx.Module):
         """Whether what is reflected depends on a normal."""
         return any(table is not None and table.about != "eye" for table in (self.tinted, self.plain))
 
-    def reflect(self, s: Scalar, magnitude: Scalar, normal: Triple, w_o: Triple, arriving: Channels) -> tuple[Triple, Triple]:
+    def reflect(
+        self, s: Scalar, magnitude: Scalar, normal: Triple, w_o: Triple, arriving: Channels, cut: Scalar | float = 0.0
+    ) -> tuple[Triple, Triple]:
         """What the colour of the medium is multiplied with, and what is added to that in the light's own colour.
 
-        `magnitude`: length of the gradient. Where it is weak, bands of the light above the first count less. The normal is turned to the
-        eye.
+        `magnitude`: length of the gradient. Where it is weak, bands of the light above the first count less, but for the share of a point
+        that is a `cut`. The normal is turned to the eye.
         """
         zero, surface = jnp.zeros_like(s), share_of(magnitude, self.threshold)
+        surface = surface + cut * (1 - surface)
         coefficients, share = self._light(arriving, s)
         turn = jnp.where(dot(normal, w_o) < 0, -1.0, 1.0)
         normal = tuple(turn * c for c in normal)

@@ -312,7 +312,7 @@ class _Kinds(NamedTuple):
 
 def has_rows(scene: Scene) -> bool:
     """Whether entries of the transfer function act through what a sample is classified as, and nothing else."""
-    by_gradient = needs_gradient(scene) and scene.normals.of_opacity
+    by_gradient = needs_gradient(scene) and scene.normals.follows_transfer(scene.volume)
     shade = scene.shadows is not None or (scene.radiance_transfer is not None and not scene.radiance_transfer.is_frozen)
     return isinstance(scene.transfer, AbstractTable) and not shade and not by_gradient
 

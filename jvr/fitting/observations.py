@@ -14,21 +14,27 @@ from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
 from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.model.camera import AbstractCamera
+from jvr.model.exact import Exact
 from jvr.model.scene import Scene
+from jvr.numerics import two_sum
 from jvr.rendering.medium import medium, natural, occupancy, visibility
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Seen, enter, step_length
+from jvr.rendering.trace import Seen, ahead, enter, near_volume, step_length
 from jvr.types import Triple
 
 
 class Observations(eqx.Module):
     """World rays with the colour that each should have. Rays that cross more of the volume come first.
 
+    A ray starts at `origin + low`, the eye is `behind` that by so much (see `AbstractCamera.rays_ahead`).
+
     `weight` is 0 for the rays that fill up the last chunk. `start` is where a ray's kept samples begin, all 0 without any.
     """
 
     origin: Triple
+    low: Triple
+    behind: Float[Array, "rays"]
     direction: Triple
     target: Float[Array, "rays 3"]
     weight: Float[Array, "rays"]
@@ -98,19 +104,43 @@ def observe(
         raise ValueError("a fit resamples the midpoints of segments: leave Settings(quadrature=...) at jvr.Midpoint()")
     if not isinstance(settings.sampling, Uniform):
         raise ValueError("a fit takes every sample of every ray: leave Settings(sampling=...) at jvr.Uniform()")
-    rays = [camera.rays(jnp.arange(camera.width * camera.height, dtype=jnp.int32)) for camera in cameras]
-    origin, direction = jax.tree.map(lambda *parts: np.concatenate(parts), *rays)
+    # Compiled for all cameras of one size and kind.
+    rays = [_rays(scene, camera) for camera in cameras]
+    (origin, low), direction, behind = jax.tree.map(lambda *parts: np.concatenate(parts), *rays)
     target = np.concatenate([image.reshape(-1, 3) for image in images])
     weight = np.concatenate([w.ravel() for w in _check_weights(cameras, weights, target.dtype)])
-    inside, _ = jax.jit(enter)(scene, tuple(map(jnp.asarray, origin)), tuple(map(jnp.asarray, direction)))
-    order = np.argsort(-np.asarray(inside.length), kind="stable")
+    shared = lambda tree: jax.tree.map(jnp.asarray, tree)
+    start = jnp.zeros(len(behind), jnp.int32)
+    placed = (shared(origin), shared(low), shared(behind), shared(direction))
+    whole = Observations(*placed, jnp.asarray(target), jnp.asarray(weight), start)
+    order = np.argsort(-np.asarray(_inside(scene, whole).length), kind="stable")
     fill = -len(order) % chunk
     order = np.concatenate([order, np.full(fill, order[-1])])
-    weight = weight[order]
-    weight[len(order) - fill :] = 0
-    take = lambda x: jnp.asarray(x[order])
-    start = jnp.zeros(len(order), jnp.int32)
-    return Observations(jax.tree.map(take, origin), jax.tree.map(take, direction), take(target), jnp.asarray(weight), start)
+    whole = jax.tree.map(lambda x: x[order], whole)
+    return eqx.tree_at(lambda o: o.weight, whole, whole.weight.at[len(order) - fill :].set(0))
+
+
+@jax.jit
+def _rays(scene: Scene, camera: AbstractCamera) -> tuple[tuple[Triple, Triple], Triple, Float[Array, "rays"]]:
+    """The rays of a camera from near the volume on: starts in the world as two floats, directions, and the distances from the eye."""
+    zero = scene.volume.origin
+    scene, camera = near_volume(scene, camera)
+    pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
+    origin, direction, behind = camera.rays_ahead(pixels, ahead(scene, camera))
+    starts = [two_sum(zero.high[i], zero.low[i], x) for i, x in enumerate(origin)]
+    return (tuple(high for high, _ in starts), tuple(low for _, low in starts)), direction, behind
+
+
+@jax.jit
+def _inside(scene: Scene, piece: Observations) -> Rays:
+    """The rays inside of the volume, wherever that is in the world."""
+    zero = jax.lax.stop_gradient(scene.volume.origin)
+    (scene,) = near_volume(scene)
+    origin = tuple(
+        Exact(high, low).minus(Exact(zero.high[i], zero.low[i])).rounded()
+        for i, (high, low) in enumerate(zip(piece.origin, piece.low, strict=True))
+    )
+    return enter(scene, origin, piece.direction, piece.behind)[0]
 
 
 def thin(observations: Observations, every: int, chunk: int) -> Observations:
@@ -151,6 +181,7 @@ def keep_samples(
 def seen_in_fit(scene: Scene, settings: Settings, visible: AbstractVisibility | None = None) -> Seen:
     """What is computed once for all rays; `visible`: how much light reaches a point, where that is known. Without a bound on what is
     negligible, derivatives would not leap over anything."""
+    (scene,) = near_volume(scene)
     where = occupancy(scene, settings) if settings.negligible else None
     return Seen(where, visibility(scene, where) if visible is None else visible, natural(scene))
 
@@ -159,8 +190,8 @@ def observed_medium(
     scene: Scene, piece: Observations, samples: Samples | None, settings: Settings, seen: Seen
 ) -> tuple[Medium, Rays]:
     """What the rays of a piece march through, resampled anew or from kept samples, and the rays inside of it."""
-    rays, _ = enter(scene, piece.origin, piece.direction)
-    through = medium(scene, settings, *seen)
+    rays = _inside(scene, piece)
+    through = medium(near_volume(scene)[0], settings, *seen)
     if samples is not None:
         through = through._replace(field=KeptField(samples.stored, piece.start, samples.low, samples.scale, samples.stride))
     return through, rays
@@ -168,13 +199,13 @@ def observed_medium(
 
 @eqx.filter_jit
 def _longest(scene: Scene, piece: Observations, settings: Settings) -> Int[Array, ""]:
-    rays, _ = enter(scene, piece.origin, piece.direction)
+    rays = _inside(scene, piece)
     return jnp.max(segment_count(rays.length, step_length(scene, settings)))
 
 
 @eqx.filter_jit
 def _resample(scene: Scene, piece: Observations, settings: Settings, k: Int[Array, ""], low: Array, scale: Array) -> Array:
-    rays, _ = enter(scene, piece.origin, piece.direction)
+    rays = _inside(scene, piece)
     dt = step_length(scene, settings)
     _, u = segment(k, segment_count(rays.length, dt), rays.length, dt)
     s = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u)).s

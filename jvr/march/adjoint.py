@@ -221,16 +221,19 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marc
     before = transmittance(*front)
     small_gradient, cotangents = pull(segment_cotangents(cotangent, state.behind, before, dtau, u))
 
+    # A ray that is done has no derivative, whatever the voxel that it reads.
+    on = state.j < back.steps
+    small_gradient = (*small_gradient[:3], jax.tree.map(lambda x: jnp.where(on, x, 0.0), small_gradient[3]), small_gradient[4])
     transfer, shader, shadows, ray_gradient, dt_gradient = jax.tree.map(
         jnp.add, (total.medium.transfer, total.medium.shader, total.medium.shadows, state.gradient, total.dt), small_gradient
     )
     # Else the whole computation of the cotangent is repeated in each of the scattered additions, which then take three times as long.
-    cotangents = computed_once(state.j < back.steps, cotangents)
+    cotangents = computed_once(on, cotangents)
     field = total.medium.field
     for points, of_sample in zip(sampled, cotangents, strict=True):
         field = medium.field.deposit(field, points, of_sample)
     behind = step_back(state.behind, front, emitted, dtau, u)
-    state = _ReplayState(behind, state.j + (state.j < back.steps), ray_gradient)
+    state = _ReplayState(behind, state.j + on, ray_gradient)
     return state, _Gradients(Medium(field, transfer, shader, total.medium.occupancy, shadows), dt_gradient)
 
 

@@ -95,13 +95,20 @@ def places(
 
 
 def resample(medium: Medium, sampled: list[Point], proof: Bool[Array, "rays"]) -> tuple[Sample, ...]:
-    """The field at each of the places, once for all channels of the shader; `proof` as in `computed_once`."""
-    return computed_once(proof, tuple(jax.vmap(medium.field.resample)(points) for points in sampled))
+    """The field at each of the places, once for all channels of the shader; `proof` as in `computed_once`, and zero where it is false."""
+    return tuple(_known(medium, points, proof) for points in sampled)
+
+
+def _known(medium: Medium, points: Point, proof: Bool[Array, "rays"]) -> Sample:
+    """The field at a batch of points. A ray that has no segment there reads some voxel all the same, which may be NaN: what it reads is
+    zero, in value and in derivative."""
+    sample = computed_once(proof, jax.vmap(medium.field.resample)(points))
+    return jax.tree.map(lambda x: jnp.where(proof.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0), sample)
 
 
 def classify_at(medium: Medium, points: Point, proof: Bool[Array, "points"]) -> tuple[Classified, Sample]:
     """Colour and extinction at a batch of points, and what the shader knows of them; `proof` as in `computed_once`."""
-    samples = computed_once(proof, jax.vmap(medium.field.resample)(points))
+    samples = _known(medium, points, proof)
     prepared = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, points)
     return jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, prepared), prepared
 

@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -14,17 +15,32 @@ from jvr.model.transfer import Classified
 from jvr.numerics import direction_and_length
 from jvr.types import Channels, Scalar
 
+# How many roundings of the scalar a difference between neighbouring voxels has to exceed to count as one.
+ROUNDINGS = 4
+
 
 class GradientFrame(eqx.Module):
-    """Takes what the field resampled to a gradient in the world: `axes_inverse` is that of the volume, `shape` its voxels."""
+    """Takes what the field resampled to a gradient in the world: `axes_inverse` and `intercept` are those of the volume, `shape` its
+    voxels. What is no more than rounding leaves of equal scalars is zero."""
 
     normals: AbstractNormals
     axes_inverse: Float[Array, "3 3"]
+    intercept: Scalar
     shape: tuple[int, int, int] = eqx.field(static=True)
 
     def in_world(self, transfer: Any, sample: Sample, point: Point) -> Sample:
         """The sample with its gradient per world length, along the world's axes."""
         along = self.normals.gradient(transfer, self.shape, point.p, (sample.s, sample.gradient, sample.neighbours))
+        # The largest numbers, by which files mark what has no data, would overflow.
+        largest = jnp.finfo(sample.s.dtype).max / 1024
+        along = tuple(jnp.clip(g, -largest, largest) for g in along)
+        # Interpolation rounds scalars before the intercept is added.
+        unit = ROUNDINGS * jnp.finfo(sample.s.dtype).eps
+        noise = jax.lax.stop_gradient(
+            unit * self.normals.scale(transfer, sample.s, jnp.abs(sample.s) + 2 * jnp.abs(self.intercept))
+        )
+        is_noise = jnp.maximum(jnp.maximum(jnp.abs(along[0]), jnp.abs(along[1])), jnp.abs(along[2])) <= noise
+        along = tuple(jnp.where(is_noise, 0.0, g) for g in along)
         world = tuple(sum((self.axes_inverse[j, i] * along[j] for j in range(3)), jnp.zeros_like(sample.s)) for i in range(3))
         return sample._replace(gradient=world, neighbours=())
 

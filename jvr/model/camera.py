@@ -10,27 +10,54 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jvr.model.checks import affine, float_array, require
+from jvr.model.exact import Exact, Remainder, in_double
 from jvr.numerics import normalise
 from jvr.types import Affine, ArrayLike, Scalar, Triple
 
 
 class AbstractCamera(eqx.Module):
-    """A camera looks along -z of its own frame, y up; pixel (row, column) = (0, 0) is at the top left."""
+    """A camera looks along -z of its own frame, y up; pixel (row, column) = (0, 0) is at the top left.
+
+    `remainder` is what single precision leaves of a pose that was given in double precision (see `jvr.model.exact`): a camera far away
+    from the volume then still aims at the same voxel, and one far from the world's origin stays where it is.
+    """
 
     world_from_camera: eqx.AbstractVar[Affine]
     width: eqx.AbstractVar[int]
     height: eqx.AbstractVar[int]
+    remainder: eqx.AbstractVar[Remainder]
 
     @abc.abstractmethod
+    def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
+        """The rays through the centres of `pixels = row * width + column`: a point of each on the plane `ahead` in front of the eye, across
+        the view; unit directions; the distances from the eye (for parallel rays the image plane) to these points. World; traceable.
+
+        The nearer that plane is to what is looked at, the more digits its points have."""
+
     def rays(self, pixels: Int[Array, "rays"]) -> tuple[Triple, Triple]:
         """World origins and unit directions through the centres of `pixels = row * width + column`; traceable."""
+        origin, direction, _ = self.rays_ahead(pixels, jnp.zeros_like(self.world_from_camera[0, 0]))
+        return origin, direction
+
+    def axis_at(self, ahead: Scalar) -> Triple:
+        """The point of the axis of view at a distance from the eye, to the last digit."""
+        matrix, low = self.world_from_camera, self.remainder.beside(self.world_from_camera)
+        x = Exact(matrix[:3, 3], low[:3, 3]).plus_product(Exact(matrix[:3, 2], low[:3, 2]), -ahead).rounded()
+        return x[0], x[1], x[2]
+
+    def moved(self, origin: Exact) -> "AbstractCamera":
+        """The same camera in a world whose origin is at `origin`."""
+        matrix, low = self.world_from_camera, self.remainder.beside(self.world_from_camera)
+        place = Exact(matrix[:3, 3], low[:3, 3]).minus(origin)
+        matrix, low = matrix.at[:3, 3].set(place.high), low.at[:3, 3].set(place.low)
+        return eqx.tree_at(lambda c: (c.world_from_camera, c.remainder), self, (matrix, Remainder(matrix, low)))
 
 
 class PerspectiveCamera(AbstractCamera):
     """A pinhole camera.
 
     **Arguments:** `world_from_camera`: 4x4 rigid transform; `fov_y`: full vertical angle of view in degrees, 0 ... 180;
-    `width`, `height`: pixels (static). Pose and `fov_y` are differentiable.
+    `width`, `height`: pixels (static); `remainder`: of a pose that JAX holds already. Pose and `fov_y` are differentiable.
     **Raises** `ValueError` for sizes below 1 or an angle out of range.
     """
 
@@ -38,9 +65,19 @@ class PerspectiveCamera(AbstractCamera):
     fov_y: Scalar
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
+    remainder: Remainder
 
-    def __init__(self, world_from_camera: ArrayLike, fov_y: ArrayLike, width: int, height: int):
+    def __init__(
+        self,
+        world_from_camera: ArrayLike,
+        fov_y: ArrayLike,
+        width: int,
+        height: int,
+        *,
+        remainder: Remainder | None = None,
+    ):
         self.world_from_camera = affine(world_from_camera, "world_from_camera")
+        self.remainder = Remainder.left(world_from_camera, self.world_from_camera, remainder)
         self.fov_y = float_array(fov_y, "fov_y", ())
         require(
             self.fov_y,
@@ -54,14 +91,15 @@ class PerspectiveCamera(AbstractCamera):
         cls, eye: ArrayLike, target: ArrayLike, up: ArrayLike, fov_y: ArrayLike, width: int, height: int
     ) -> "PerspectiveCamera":
         """The camera at `eye` that looks at `target`; `up` need not be orthogonal to the view. Traceable, differentiable."""
-        return cls(look_at(eye, target, up), fov_y, width, height)
+        pose, remainder = _looking(eye, target, up)
+        return cls(pose, fov_y, width, height, remainder=remainder)
 
-    def rays(self, pixels: Int[Array, "rays"]) -> tuple[Triple, Triple]:
+    def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
         x, y = _plane(self, pixels, 2 * jnp.tan(jnp.deg2rad(self.fov_y) / 2))
         norm = jnp.sqrt(x * x + y * y + 1)
         direction = _rotate(self.world_from_camera, (x / norm, y / norm, -1 / norm))
-        origin = tuple(jnp.broadcast_to(self.world_from_camera[i, 3], x.shape) for i in range(3))
-        return origin, direction
+        aside = _rotate(self.world_from_camera, (ahead * x, ahead * y, jnp.zeros_like(x)))
+        return tuple(a + c for a, c in zip(aside, self.axis_at(ahead), strict=True)), direction, ahead * norm
 
 
 class OrthographicCamera(AbstractCamera):
@@ -74,9 +112,19 @@ class OrthographicCamera(AbstractCamera):
     height_world: Scalar
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
+    remainder: Remainder
 
-    def __init__(self, world_from_camera: ArrayLike, height_world: ArrayLike, width: int, height: int):
+    def __init__(
+        self,
+        world_from_camera: ArrayLike,
+        height_world: ArrayLike,
+        width: int,
+        height: int,
+        *,
+        remainder: Remainder | None = None,
+    ):
         self.world_from_camera = affine(world_from_camera, "world_from_camera")
+        self.remainder = Remainder.left(world_from_camera, self.world_from_camera, remainder)
         self.height_world = float_array(height_world, "height_world", ())
         require(self.height_world, lambda h: h > 0, "height_world must be a positive world length")
         self.width, self.height = _size(width, height)
@@ -86,14 +134,15 @@ class OrthographicCamera(AbstractCamera):
         cls, eye: ArrayLike, target: ArrayLike, up: ArrayLike, height_world: ArrayLike, width: int, height: int
     ) -> "OrthographicCamera":
         """The camera whose image plane is centred on `eye` and that looks at `target`; traceable, differentiable."""
-        return cls(look_at(eye, target, up), height_world, width, height)
+        pose, remainder = _looking(eye, target, up)
+        return cls(pose, height_world, width, height, remainder=remainder)
 
-    def rays(self, pixels: Int[Array, "rays"]) -> tuple[Triple, Triple]:
+    def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
         x, y = _plane(self, pixels, self.height_world)
-        offset = _rotate(self.world_from_camera, (x, y, jnp.zeros_like(x)))
-        origin = tuple(offset[i] + self.world_from_camera[i, 3] for i in range(3))
+        aside = _rotate(self.world_from_camera, (x, y, jnp.zeros_like(x)))
         forward = _rotate(self.world_from_camera, (jnp.zeros_like(x), jnp.zeros_like(x), -jnp.ones_like(x)))
-        return origin, forward
+        origin = tuple(a + c for a, c in zip(aside, self.axis_at(ahead), strict=True))
+        return origin, forward, jnp.broadcast_to(ahead, x.shape)
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Affine:
@@ -101,16 +150,31 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Affine:
 
     **Raises** `ValueError` where `eye` is `target`, or `up` is parallel to the view. Differentiable in all three.
     """
-    eye, target, up = (float_array(v, name, (3,)) for v, name in ((eye, "eye"), (target, "target"), (up, "up")))
-    back = normalise(eye - target)
+    return _looking(eye, target, up)[0]
+
+
+def _looking(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> tuple[Affine, Remainder]:
+    """`look_at`, with the digits of eye and view that its result has no room for."""
+    places = []
+    for value, name in ((eye, "eye"), (target, "target")):
+        array = float_array(value, name, (3,))
+        places.append(Exact(array, Remainder.left(value, array).low))
+    up, view = float_array(up, "up", (3,)), places[0].minus(places[1])
+    back = normalise(view.rounded())
     side = jnp.cross(normalise(up), back)
     require(back, lambda b: np.any(b != 0), "look_at needs an eye apart from its target")
     require(
         side, lambda r: np.linalg.norm(r) > 1e-6, "look_at needs an up vector that is not parallel to the view: choose another up"
     )
     right = normalise(side)
-    columns = jnp.stack([right, jnp.cross(back, right), back, eye], axis=1)
-    return jnp.concatenate([columns, jnp.array([[0, 0, 0, 1]], columns.dtype)])
+    columns = jnp.stack([right, jnp.cross(back, right), back, places[0].high], axis=1)
+    length = jax.lax.stop_gradient(jnp.dot(back, view.rounded()))
+    missed = view.plus_product(Exact(back, jnp.zeros_like(back)), -length).rounded()
+    low = jnp.stack(
+        [jnp.zeros_like(back), jnp.zeros_like(back), missed / jnp.where(length > 0, length, 1.0), places[0].low], axis=1
+    )
+    pose, low = (jnp.concatenate([x, jnp.array([[0, 0, 0, last]], x.dtype)]) for x, last in ((columns, 1), (low, 0)))
+    return pose, Remainder(pose, low)
 
 
 def orbit(
@@ -141,14 +205,12 @@ def fibonacci_sphere(
 def _around(center: ArrayLike, radius: ArrayLike, offsets: list[Any], up: Array, fov_y: ArrayLike, width: int, height: int):
     if not offsets:
         raise ValueError("count must be at least 1")
-    center = float_array(center, "center", (3,))
-    cameras = []
+    float_array(center, "center", (3,))
+    center, radius, cameras = in_double(center), in_double(radius), []
     for offset in offsets:
         # At the poles of the sphere z cannot point up in the picture; y then does.
         upward = jnp.where(jnp.abs(jnp.dot(jnp.asarray(offset), up)) > 0.999, jnp.roll(up, -1), up)
-        cameras.append(
-            PerspectiveCamera.look_at(center + jnp.asarray(radius) * jnp.asarray(offset), center, upward, fov_y, width, height)
-        )
+        cameras.append(PerspectiveCamera.look_at(center + radius * in_double(offset), center, upward, fov_y, width, height))
     return tuple(cameras)
 
 

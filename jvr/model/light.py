@@ -5,7 +5,7 @@ single number is grey. Everything is differentiable.
 """
 
 import abc
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model.checks import float_array, require
+from jvr.model.exact import Exact, Remainder, in_double
 from jvr.model.ranges import DEGREES, NOT_NEGATIVE, POSITIVE, UnitVector, within
-from jvr.numerics import direction_and_length, dot
+from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import ArrayLike, Scalar, Triple, Vector
 
 
@@ -37,6 +38,10 @@ class AbstractLight(eqx.Module):
     def arrives(self, x: Triple, w_o: Triple) -> Arrival:
         """Light at world position `x`, which is looked at from the unit direction `w_o` (to the eye)."""
 
+    @abc.abstractmethod
+    def moved(self, origin: Exact) -> "AbstractLight":
+        """The same light in a world whose origin is at `origin`."""
+
 
 class DirectionalLight(AbstractLight):
     """Parallel light, as from the sun.
@@ -55,6 +60,9 @@ class DirectionalLight(AbstractLight):
         travels, _ = direction_and_length(_three(self.direction))
         return Arrival(tuple(-d for d in travels), jnp.full_like(x[0], jnp.inf), _rgb(self.irradiance))
 
+    def moved(self, origin: Exact) -> "DirectionalLight":
+        return self
+
 
 class PointLight(AbstractLight):
     """A point that shines in all directions. Irradiance at distance `r` is `intensity / max(r, radius)^2`, or with
@@ -62,12 +70,14 @@ class PointLight(AbstractLight):
 
     **Arguments:** `position`: `(3,)`, world; `intensity`: power per solid angle, a number or `(3,)`, not negative; `radius`: distance
     below which the light grows no brighter, positive: at the light itself irradiance is not defined. `attenuation`: not negative, `c > 0`.
+    `remainder`: of a position that JAX holds already (see `jvr.model.exact`).
     """
 
     position: Vector
     intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
     radius: Scalar = eqx.field(metadata=within(POSITIVE))
     attenuation: Vector | None = eqx.field(metadata=within(POSITIVE))
+    remainder: Remainder
 
     def __init__(
         self,
@@ -76,8 +86,10 @@ class PointLight(AbstractLight):
         *,
         radius: ArrayLike = 1e-3,
         attenuation: ArrayLike | None = None,
+        remainder: Remainder | None = None,
     ):
         self.position = float_array(position, "position", (3,))
+        self.remainder = Remainder.left(position, self.position, remainder)
         require(self.position, np.isfinite, "a light's position must be finite")
         self.intensity = _colour(intensity, "intensity")
         self.radius = float_array(radius, "radius", ())
@@ -88,6 +100,9 @@ class PointLight(AbstractLight):
         towards, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
         falloff = _falloff(distance, self.radius, self.attenuation)
         return Arrival(towards, distance, tuple(i * falloff for i in _rgb(self.intensity)))
+
+    def moved(self, origin: Exact) -> "PointLight":
+        return _at(self, origin)
 
 
 class SpotLight(AbstractLight):
@@ -105,6 +120,7 @@ class SpotLight(AbstractLight):
     outer: Scalar = eqx.field(metadata=within(DEGREES))
     radius: Scalar = eqx.field(metadata=within(POSITIVE))
     attenuation: Vector | None = eqx.field(metadata=within(POSITIVE))
+    remainder: Remainder
 
     def __init__(
         self,
@@ -116,9 +132,10 @@ class SpotLight(AbstractLight):
         outer: ArrayLike = 30.0,
         radius: ArrayLike = 1e-3,
         attenuation: ArrayLike | None = None,
+        remainder: Remainder | None = None,
     ):
-        point = PointLight(position, intensity, radius=radius, attenuation=attenuation)
-        self.position, self.intensity = point.position, point.intensity
+        point = PointLight(position, intensity, radius=radius, attenuation=attenuation, remainder=remainder)
+        self.position, self.intensity, self.remainder = point.position, point.intensity, point.remainder
         self.radius, self.attenuation = point.radius, point.attenuation
         self.direction = _direction(direction, "SpotLight")
         self.inner, self.outer = float_array(inner, "inner", ()), float_array(outer, "outer", ())
@@ -130,10 +147,17 @@ class SpotLight(AbstractLight):
     def arrives(self, x: Triple, w_o: Triple) -> Arrival:
         towards, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
         axis, _ = direction_and_length(_three(self.direction))
-        edge, full = jnp.cos(jnp.deg2rad(self.outer)), jnp.cos(jnp.deg2rad(self.inner))
-        share = jnp.clip((-dot(axis, towards) - edge) / (full - edge), 0.0, 1.0)
+        # With squares of sines of half the angles in place of cosines, which are all 1 in a narrow cone. That between axis and light is a
+        # quarter of `|axis + towards|^2`; that of `outer` less that of `inner` is a product.
+        outer, inner = jnp.deg2rad(self.outer) / 2, jnp.deg2rad(self.inner) / 2
+        aside = 0.25 * sum(jnp.square(a + b) for a, b in zip(axis, towards, strict=True))
+        width = jnp.sin(outer + inner) * jnp.sin(outer - inner)
+        share = jnp.clip(divide_or_zero(jnp.square(jnp.sin(outer)) - aside, width), 0.0, 1.0)
         falloff = share * share * (3 - 2 * share) * _falloff(distance, self.radius, self.attenuation)
         return Arrival(towards, distance, tuple(i * falloff for i in _rgb(self.intensity)))
+
+    def moved(self, origin: Exact) -> "SpotLight":
+        return _at(self, origin)
 
 
 class HeadLight(AbstractLight):
@@ -148,6 +172,9 @@ class HeadLight(AbstractLight):
 
     def arrives(self, x: Triple, w_o: Triple) -> Arrival:
         return Arrival(w_o, jnp.full_like(x[0], jnp.inf), _rgb(self.irradiance))
+
+    def moved(self, origin: Exact) -> "HeadLight":
+        return self
 
 
 class AmbientLight(eqx.Module):
@@ -190,8 +217,9 @@ def disc_light(
 def _spread(position: ArrayLike, radius: float, intensity: ArrayLike, offsets: Float[Array, "n 3"]) -> tuple[PointLight, ...]:
     if not radius > 0:
         raise ValueError(f"a light's radius must be positive, not {radius!r}; a PointLight has none")
-    center, n = float_array(position, "position", (3,)), offsets.shape[0]
-    return tuple(PointLight(center + radius * offset, _colour(intensity, "intensity") / n) for offset in offsets)
+    float_array(position, "position", (3,))
+    center, n = in_double(position), offsets.shape[0]
+    return tuple(PointLight(center + radius * in_double(offset), _colour(intensity, "intensity") / n) for offset in offsets)
 
 
 def perpendicular(axis: Triple) -> tuple[Triple, Triple]:
@@ -201,6 +229,12 @@ def perpendicular(axis: Triple) -> tuple[Triple, Triple]:
     a = -1.0 / (sign + z)
     b = x * y * a
     return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+def _at(light: Any, origin: Exact) -> Any:
+    """A light with a position, moved."""
+    position = Exact(light.position, light.remainder.beside(light.position)).minus(origin).rounded()
+    return eqx.tree_at(lambda x: (x.position, x.remainder), light, (position, Remainder.left(position, position)))
 
 
 def _falloff(distance: Scalar, radius: Scalar, attenuation: Vector | None) -> Scalar:

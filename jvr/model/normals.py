@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jvr.model.transfer import AbstractTransfer
-from jvr.model.volume import Volume, gradients_at_voxels
+from jvr.model.volume import Nearest, Trilinear, Volume, gradients_at_voxels
 from jvr.numerics import add_runs, divide_or_zero, read_run
 from jvr.types import Channels, Scalar, Triple
 
@@ -46,10 +46,33 @@ class AbstractNormals(eqx.Module):
         """The same with what can be computed before rays are marched; differentiable."""
         return self
 
+    def follows_transfer(self, volume: Volume) -> bool:
+        """Whether gradients change with the transfer function."""
+        return self.of_opacity
+
+    def scale(self, transfer: AbstractTransfer, s: Scalar, size: Scalar) -> Scalar:
+        """What relative roundings of a scalar `s` come to in what is differentiated, where the scalar is a sum of terms of this size."""
+        if not self.of_opacity:
+            return size
+        sigma_t, slope = jax.value_and_grad(lambda s: extinction(transfer, s))(s)
+        return jnp.abs(sigma_t) + jnp.abs(slope) * size
+
 
 class AnalyticGradient(AbstractNormals):
     """The gradient of the interpolant itself: exact, nothing else is read, but not continuous from one cell of a trilinear interpolant to
-    the next (the field between cells has kinks). The default."""
+    the next (the field between cells has kinks). The default.
+
+    The nearest voxel's value has none: for labels it is that of `PrecomputedGradient(of_opacity=True)`, unless the transfer function asks
+    for the gradient of the scalar.
+    """
+
+    def prepared(self, volume: Volume, transfer: AbstractTransfer) -> AbstractNormals:
+        if isinstance(volume.interpolation, Nearest) and not transfer.takes_gradient:
+            return PrecomputedGradient(of_opacity=True).prepared(volume, transfer)
+        return self
+
+    def follows_transfer(self, volume: Volume) -> bool:
+        return self.of_opacity or isinstance(volume.interpolation, Nearest)
 
     def resample(self, volume: Volume, p: Triple) -> Resampled:
         s, gradient = jax.value_and_grad(lambda p: volume.sample(p, in_runs=True))(p)
@@ -152,7 +175,9 @@ class SobelDifferences(AbstractDifferences):
 class PrecomputedGradient(AbstractNormals):
     """Central differences at every voxel, computed once and interpolated like the voxels: smooth, for 12 bytes a voxel.
 
-    They are computed anew in each picture unless the volume keeps them (`Volume.graded()`, not with `of_opacity`).
+    They are computed anew in each picture unless the volume keeps them (`Volume.graded()`, not with `of_opacity`). Of labels, whose values
+    are those of the nearest voxel, the extinction is smoothed before (1, 4, 6, 4, 1 along each axis), and the gradients are interpolated
+    nevertheless: normals of a ball of labels, 10 voxels in radius, are then off by 3 degrees on average in place of 21.
     """
 
     gradients: Float[Array, "x y z 3"] | None = None
@@ -163,12 +188,13 @@ class PrecomputedGradient(AbstractNormals):
         values = volume.values.astype(volume.slope.dtype) * volume.slope + volume.intercept
         if self.of_opacity:
             values = jax.vmap(lambda s: extinction(transfer, s))(values.reshape(-1)).reshape(values.shape)
+            values = _smoothed(values) if isinstance(volume.interpolation, Nearest) else values
         return PrecomputedGradient(self.of_opacity, gradients_at_voxels(values))
 
     def resample(self, volume: Volume, p: Triple) -> Resampled:
         assert self.gradients is not None
         rows, total = self.gradients.reshape(-1, 3), jnp.zeros(3, self.gradients.dtype)
-        for start, weights in volume.interpolation.stencil(volume.shape, p):
+        for start, weights in Trilinear().stencil(volume.shape, p):
             total += sum(w * read_run(rows, start + i, 1)[0] for i, w in enumerate(weights))
         # One array: apart, each of its components would read all three anew.
         return volume.sample(p), (), (total,)
@@ -178,7 +204,7 @@ class PrecomputedGradient(AbstractNormals):
         own = total[1]
         if own.gradients is not None:
             rows = own.gradients.reshape(-1, 3)
-            for starts, weights in jax.vmap(lambda p: volume.interpolation.stencil(volume.shape, p))(p):
+            for starts, weights in jax.vmap(lambda p: Trilinear().stencil(volume.shape, p))(p):
                 rows = add_runs(rows, starts, jnp.stack(weights, 1)[..., None] * of_gradient[:, None])
             own = PrecomputedGradient(self.of_opacity, rows.reshape(own.gradients.shape))
         return volume.deposit(total[0], p, of_value), own
@@ -186,6 +212,16 @@ class PrecomputedGradient(AbstractNormals):
     def gradient(self, transfer: AbstractTransfer, shape: tuple[int, int, int], p: Triple, resampled: Resampled) -> Triple:
         (gradient,) = resampled[2]
         return gradient[0], gradient[1], gradient[2]
+
+
+def _smoothed(values: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
+    """Averages of five voxels along each axis, with binomial weights; the border is repeated."""
+    for axis, n in enumerate(values.shape):
+        if n > 1:
+            padded = jnp.pad(values, [(2, 2) if a == axis else (0, 0) for a in range(3)], mode="edge")
+            parts = (w / 16 * jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k, w in enumerate((1, 4, 6, 4, 1)))
+            values = sum(parts, jnp.zeros_like(values))
+    return values
 
 
 def extinction(transfer: AbstractTransfer, s: Scalar) -> Scalar:

@@ -1,6 +1,7 @@
 """The scalar volume: voxels, where they lie in the world, and how values between them are defined."""
 
 import abc
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.checks import affine, float_array, require
+from jvr.model.exact import Exact, Remainder
 from jvr.model.packing import Squares, squares_of
 from jvr.numerics import add_runs, read_at, read_run, transformed, turned
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
@@ -72,6 +74,8 @@ class Volume(eqx.Module):
     - `world_from_grid`: 4x4 affine, default the identity.
     - `slope`, `intercept`: scalars, default 1 and 0, as DICOM's rescale.
     - `interpolation`: `Trilinear()` (default) or `Nearest()`.
+    - `remainder`: of a `world_from_grid` that JAX holds already: what single precision leaves of one that was given in double precision
+      (see `jvr.model.exact`). Positions of cameras, lights and clipping boxes are taken relative to the volume before they are rounded.
 
     `bricks` is `None` until `bricked()` makes them.
 
@@ -87,6 +91,7 @@ class Volume(eqx.Module):
     bricks: Bricks | None
     squares: Squares | None
     gradients: Float[Array, "x y z 3"] | None
+    remainder: Remainder
 
     def __init__(
         self,
@@ -96,6 +101,7 @@ class Volume(eqx.Module):
         slope: ArrayLike = 1.0,
         intercept: ArrayLike = 0.0,
         interpolation: AbstractInterpolation = Trilinear(),
+        remainder: Remainder | None = None,
     ):
         values = jnp.asarray(values)
         if values.ndim != 3 or values.size == 0:
@@ -107,7 +113,9 @@ class Volume(eqx.Module):
         if not (jnp.issubdtype(values.dtype, jnp.floating) or jnp.issubdtype(values.dtype, jnp.integer)):
             raise TypeError(f"voxels must be real or integer numbers, not {values.dtype}")
         self.values = values
-        self.world_from_grid = affine(jnp.eye(4) if world_from_grid is None else world_from_grid, "world_from_grid")
+        world_from_grid = jnp.eye(4) if world_from_grid is None else world_from_grid
+        self.world_from_grid = affine(world_from_grid, "world_from_grid")
+        self.remainder = Remainder.left(world_from_grid, self.world_from_grid, remainder)
         self.slope = float_array(slope, "slope", ())
         self.intercept = float_array(intercept, "intercept", ())
         self.interpolation = interpolation
@@ -157,6 +165,16 @@ class Volume(eqx.Module):
     def spacing(self) -> Vector:
         """World length of one voxel along each grid axis, `(3,)`."""
         return jnp.linalg.norm(self.world_from_grid[:3, :3], axis=0)
+
+    @property
+    def origin(self) -> Exact:
+        """World position of voxel (0, 0, 0)."""
+        return Exact(self.world_from_grid[:3, 3], self.remainder.beside(self.world_from_grid)[:3, 3])
+
+    def moved(self, origin: Exact) -> "Volume":
+        """The same volume in a world whose origin is at `origin`."""
+        matrix = self.world_from_grid.at[:3, 3].set(self.origin.minus(origin).rounded())
+        return eqx.tree_at(lambda v: (v.world_from_grid, v.remainder), self, (matrix, Remainder.left(matrix, matrix)))
 
     @property
     def center(self) -> Vector:
@@ -235,8 +253,11 @@ class Volume(eqx.Module):
                 flat = add_runs(flat, starts, (self.slope * jnp.stack(terms, axis=1)).astype(flat.dtype))
             total = eqx.tree_at(lambda v: v.values, total, flat.reshape(self.shape))
         if total.slope is not None:
-            term = jnp.sum(jax.vmap(self.interpolate)(p) * of_value)
-            term += jnp.sum(along(self.interpolate)[1]) if of_gradient else 0.0
+            # A point without a cotangent may be at a voxel that is NaN.
+            term = jnp.sum(jnp.where(of_value == 0, 0.0, jax.vmap(self.interpolate)(p) * of_value))
+            if of_gradient:
+                none = functools.reduce(jnp.logical_and, [c == 0 for c in of_gradient])
+                term += jnp.sum(jnp.where(none, 0.0, along(self.interpolate)[1]))
             total = eqx.tree_at(lambda v: v.slope, total, total.slope + term)
         if total.intercept is not None:
             total = eqx.tree_at(lambda v: v.intercept, total, total.intercept + jnp.sum(of_value))
@@ -263,14 +284,25 @@ def _quantised(volume: Volume) -> Volume:
 class ClippingBox(eqx.Module):
     """An axis-aligned box in world coordinates; what lies outside of it is not rendered.
 
-    **Arguments:** `lower`, `upper`: `(3,)`, differentiable (moving a face changes where rays enter and leave).
+    **Arguments:** `lower`, `upper`: `(3,)`, differentiable (moving a face changes where rays enter and leave); `remainders`: of corners
+    that JAX holds already (see `jvr.model.exact`).
     **Raises** `ValueError` where `lower` is not below `upper` on every axis.
     """
 
     lower: Vector
     upper: Vector
+    remainders: tuple[Remainder, Remainder]
 
-    def __init__(self, lower: ArrayLike, upper: ArrayLike):
+    def __init__(self, lower: ArrayLike, upper: ArrayLike, *, remainders: tuple[Remainder, Remainder] | None = None):
         self.lower = float_array(lower, "ClippingBox lower", (3,))
         self.upper = float_array(upper, "ClippingBox upper", (3,))
+        given = remainders or (None, None)
+        self.remainders = (Remainder.left(lower, self.lower, given[0]), Remainder.left(upper, self.upper, given[1]))
         require(self.upper - self.lower, lambda d: d > 0, "ClippingBox needs lower < upper on every axis")
+
+    def moved(self, origin: Exact) -> "ClippingBox":
+        """The same box in a world whose origin is at `origin`."""
+        corners = zip((self.lower, self.upper), self.remainders, strict=True)
+        # A face that is infinitely far away stays there.
+        lower, upper = (jnp.where(jnp.isfinite(x), Exact(x, rest.beside(x)).minus(origin).rounded(), x) for x, rest in corners)
+        return ClippingBox(lower, upper)

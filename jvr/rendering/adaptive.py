@@ -24,7 +24,7 @@ from jvr.rendering.medium import is_lit
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Slices, SliceStats
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import develop, enter, one_precision, step_length
+from jvr.rendering.trace import ahead, develop, enter, near_volume, step_length
 from jvr.types import Channels, Scalar
 
 # Bricks across which the oracle is asked to look: a picture whose pixels are larger than that is coarser than the volume anyway.
@@ -54,9 +54,9 @@ def render_slices(
     **Raises** `ValueError` for what it cannot render: nearest-neighbour volumes, transfer functions that are not tables, cameras other
     than jvr's own, adjoints other than `jvr.Replay()`.
     """
-    scene, camera = one_precision(scene, camera)
+    scene, camera = near_volume(scene, camera)
     table = _table(scene, settings)
-    plane, dt = image_plane(camera), step_length(scene, settings)
+    plane, dt = image_plane(camera, ahead(scene, camera)), step_length(scene, settings)
     period = 2**sampling.levels
     width, height = (-(-n // period) * period for n in (camera.width, camera.height))
     options = SliceOptions(sampling.levels, width, height, settings.termination, _segment)
@@ -123,15 +123,16 @@ def _lattice(
     nearest = jnp.where(nearest < far, nearest, 0.0)
 
     rays = []
-    for _, _, level, t, whole in levels:
+    for _, _, level, _, whole in levels:
         hits = level.length > 0
+        t, *whole = whole
         rows = [jnp.where(hits, a, b) for a, b in zip((*level.entry, *level.direction), whole, strict=True)]
         # On slice k the distance from the entry is u = (nearest - t) + k dt: the large numbers cancel once, not on every slice.
-        rays.append(jnp.stack([*rows, nearest - jnp.where(hits, t, 0.0), jnp.where(hits, level.length, far)], axis=1))
+        rays.append(jnp.stack([*rows, nearest - t, jnp.where(hits, level.length, far)], axis=1))
     slice_of = lambda u: jax.lax.stop_gradient((u - nearest) / dt)
     first, last = jnp.floor(slice_of(t_in)).astype(jnp.int32), jnp.ceil(slice_of(t_in + finest.length)).astype(jnp.int32)
     apart, spread = plane.size
-    unit, unit_slope = jax.lax.stop_gradient((apart + spread * nearest, spread * dt))
+    unit, unit_slope = jax.lax.stop_gradient((apart + spread * (nearest - plane.ahead), spread * dt))
     lattice = Lattice(tuple(rays), jnp.where(inside, first, NEVER), jnp.where(inside, last, -1), unit, unit_slope)
     return lattice, finest, t_in
 
@@ -140,12 +141,13 @@ def _level(
     scene: Scene, plane: ImagePlane, options: SliceOptions, level: int
 ) -> tuple[Array, Array, Rays, Array, tuple[Array, ...]]:
     """Column and row of each pixel of a level in units of the finest, its ray inside the volume, the distance to its entry, and the
-    whole ray in grid coordinates: start, then direction."""
+    whole ray: the distance from the eye to where it starts, its entry if it has one, and in grid coordinates start, then direction."""
     height, width = options.shape(level)
     # Pixel x of a level is centred on 2^l (x + 1/2) - 1/2 (figure 5 of the paper); the ring begins at -1.
     place = lambda n: 2**level * (jnp.arange(n) - 0.5) - 0.5
     row, column = (x.reshape(-1) for x in jnp.meshgrid(place(height), place(width), indexing="ij"))
-    origin, direction = plane.rays(column, row)
-    rays, t_in = enter(scene, origin, direction)
+    origin, direction, behind = plane.rays(column, row)
+    rays, t_in = enter(scene, origin, direction, behind)
     along = scene.volume.grid_from_world(direction, direction=True)
-    return column, row, rays, t_in, (*scene.volume.grid_from_world(origin), *along)
+    starts = jnp.where(rays.length > 0, t_in, behind)
+    return column, row, rays, t_in, (starts, *scene.volume.grid_from_world(origin), *along)

@@ -6,6 +6,7 @@ Modules of effects are imported here and only for scenes that hold them; everyth
 
 from typing import Any, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
@@ -53,12 +54,16 @@ def is_lit(scene: Scene) -> bool:
 
 
 def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool, natural: Any) -> AbstractShader:
+    from jvr.effects.cut import CutFaces
     from jvr.effects.lighting import LitPreIntegratedShader, LitShader
 
     kind = LitPreIntegratedShader if pre_integrated else LitShader
     ambient = tuple(light for light in scene.lights if isinstance(light, AmbientLight))
     lights, volume = arriving_lights(scene), scene.volume
-    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering, natural)
+    cut = None
+    if scene.clipping is not None and frame is not None:
+        cut = CutFaces(scene.clipping, jnp.min(volume.spacing))
+    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering, cut, natural)
 
 
 def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
@@ -68,7 +73,9 @@ def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | No
     if scene.normals.of_opacity and scene.transfer.takes_gradient:
         raise ValueError("a transfer function of the gradient needs that of the scalar: set normals=...(of_opacity=False)")
     normals = scene.normals.prepared(scene.volume, scene.transfer)
-    return GradientFrame(scene.normals, scene.volume.axes_inverse, scene.volume.shape), normals
+    volume = scene.volume
+    # The arrays that were prepared stay with the field.
+    return GradientFrame(eqx.filter(normals, False), volume.axes_inverse, volume.intercept, volume.shape), normals
 
 
 def needs_gradient(scene: Scene) -> bool:

@@ -22,7 +22,7 @@ from jvr.rendering.medium import medium
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Refinement, RefinementStats
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Seen, composite, enter, one_precision, seen, step_length
+from jvr.rendering.trace import Seen, ahead, composite, enter, near_volume, seen, step_length
 
 
 class _Grid(NamedTuple):
@@ -53,8 +53,8 @@ def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sam
 
     **Raises** `ValueError` for a camera of another kind than jvr's own.
     """
-    scene, camera = one_precision(scene, camera)
-    plane, tile = image_plane(camera), sampling.tile
+    scene, camera = near_volume(scene, camera)
+    plane, tile = image_plane(camera, ahead(scene, camera)), sampling.tile
     # The border of the picture is interpolated from real rays around it.
     height, width = (-(-(n - 1) // tile) * tile + 1 for n in (camera.height, camera.width))
     row, column = (x.reshape(-1) for x in jnp.meshgrid(*(jnp.arange(n, dtype=jnp.int32) for n in (height, width)), indexing="ij"))

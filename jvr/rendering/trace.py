@@ -12,11 +12,15 @@ from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.occupancy import Occupancy
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
+from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
 from jvr.rendering.medium import medium, natural, occupancy, visibility
 from jvr.rendering.settings import Settings
 from jvr.types import Scalar, Triple
+
+# How many radii of the volume a camera is away from its middle for its rays to start there.
+FAR = 2.0
 
 
 class Seen(NamedTuple):
@@ -34,7 +38,7 @@ class Seen(NamedTuple):
 
 def seen(scene: Scene, settings: Settings) -> Seen:
     """What rays through a scene need to know beforehand."""
-    (scene,) = one_precision(scene)
+    (scene,) = near_volume(scene)
     where = occupancy(scene, settings)
     return Seen(where, visibility(scene, where), natural(scene))
 
@@ -69,8 +73,8 @@ def aim(
     scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], where: Seen
 ) -> tuple[Aimed, Float[Array, "rays"]]:
     """The rays of some pixels before they are marched, and the distance from the eye to their entry."""
-    scene, camera = one_precision(scene, camera)
-    rays, t_in = enter(scene, *camera.rays(pixels))
+    scene, camera = near_volume(scene, camera)
+    rays, t_in = enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)))
     return Aimed(medium(scene, settings, *where), rays, step_length(scene, settings)), t_in
 
 
@@ -84,13 +88,37 @@ def one_precision(scene: Scene, *others: Any) -> Any:
     return eqx.tree_at(voxels, promoted, scene.volume.values, is_leaf=lambda x: x is None)
 
 
+def near_volume(scene: Scene, *others: Any) -> Any:
+    """A scene and cameras in one precision and in a world whose origin is voxel (0, 0, 0), wherever that lies in theirs: differences of
+    positions are taken before they are rounded. Derivatives are those in the world of the scene."""
+    scene, *cameras = one_precision(scene, *others)
+    origin = jax.lax.stop_gradient(scene.volume.origin)
+    placed = lambda s: (s.volume, s.clipping, s.lights)
+    lights = tuple(light.moved(origin) if isinstance(light, AbstractLight) else light for light in scene.lights)
+    clipping = None if scene.clipping is None else scene.clipping.moved(origin)
+    parts = (scene.volume.moved(origin), clipping, lights)
+    scene = eqx.tree_at(placed, scene, parts, is_leaf=lambda x: x is None)
+    return scene, *(camera.moved(origin) for camera in cameras)
+
+
+def ahead(scene: Scene, camera: AbstractCamera) -> Scalar:
+    """Where in front of a camera its rays start: at the middle of the volume if that is far away, else at the eye. Detached: a ray is the
+    same wherever on it one starts."""
+    back = camera.world_from_camera[:3, 2]
+    depth = jnp.dot(back, camera.world_from_camera[:3, 3] - scene.volume.center)
+    return jax.lax.stop_gradient(jnp.where(depth > FAR * scene.volume.radius, depth, 0.0))
+
+
 def step_length(scene: Scene, settings: Settings) -> Scalar:
     """World length of a segment."""
     return settings.step * jnp.min(scene.volume.spacing)
 
 
-def enter(scene: Scene, origin: Triple, direction: Triple) -> tuple[Rays, Float[Array, "rays"]]:
-    """World rays inside the volume (and its clipping box), and the distance from their origin to where they enter.
+def enter(
+    scene: Scene, origin: Triple, direction: Triple, behind: Float[Array, "rays"] | float = 0.0
+) -> tuple[Rays, Float[Array, "rays"]]:
+    """World rays inside the volume (and its clipping box), and the distance from the eye, which is `behind` their origin by so much, to
+    where they enter.
 
     A ray with non-finite numbers gets the length NaN, which `composite` turns into a NaN pixel.
     """
@@ -100,7 +128,7 @@ def enter(scene: Scene, origin: Triple, direction: Triple) -> tuple[Rays, Float[
     if scene.clipping is not None:
         near, far = ray_box(origin, direction, tuple(scene.clipping.lower), tuple(scene.clipping.upper))
         t_in, t_out = jnp.maximum(t_in, near), jnp.minimum(t_out, far)
-    t_in = jnp.maximum(t_in, 0.0)
+    t_in = jnp.maximum(t_in, -behind)
     hit = t_out > t_in
     # A ray that misses gets harmless numbers before any arithmetic, so that its derivative is zero and not 0 * inf.
     t_in, t_out = jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0)
@@ -108,7 +136,7 @@ def enter(scene: Scene, origin: Triple, direction: Triple) -> tuple[Rays, Float[
     poison = jnp.where(jnp.isfinite(sum(start) + sum(along)), 0.0, jnp.nan)
     start, along = keep(start), keep(along)
     entry = tuple(s + t_in * d for s, d in zip(start, along, strict=True))
-    return Rays(entry, along, t_out - t_in + poison), t_in
+    return Rays(entry, along, t_out - t_in + poison), jnp.where(hit, behind + t_in, 0.0)
 
 
 def composite(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> tuple[Triple, Float[Array, "rays"]]:

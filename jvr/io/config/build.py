@@ -86,7 +86,8 @@ def build_volume(config: Config) -> Volume:
         low, high = table.scale
         scaled = (np.asarray(values, np.float64) * float(slope) + float(intercept) - low) / (high - low)
         values, slope, intercept = np.clip(scaled, 0, 1).astype(np.float32), 1.0, 0.0
-    volume = Volume(values, volume.world_from_grid, slope=slope, intercept=intercept, interpolation=interpolation)
+    placed = {"world_from_grid": volume.world_from_grid, "remainder": volume.remainder}
+    volume = Volume(values, slope=slope, intercept=intercept, interpolation=interpolation, **placed)
     with blame(config.name, "volume.packed"):
         return volume.packed() if table.packed else volume
 

@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 
 from jvr.io.config.schema.whole import AnyCamera, OrthographicTable, PerspectiveTable, RigTable
-from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, fibonacci_sphere, look_at, orbit
+from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, fibonacci_sphere, orbit
+from jvr.model.exact import in_double
 from jvr.model.volume import Volume
 
 # From the front of a patient (-y in LPS), a little from above and from the left.
@@ -16,28 +17,29 @@ MARGIN = 1.05
 
 def cameras_of(table: AnyCamera, volume: Volume) -> tuple[AbstractCamera, ...]:
     """The cameras of one table; what it leaves out comes from the box of the volume."""
-    center = np.asarray(volume.center if table.target is None else table.target, float)
+    corners = _corners(volume)
+    center = np.mean(corners, axis=0) if table.target is None else np.asarray(table.target, float)
     if isinstance(table, RigTable):
         return _rig(table, center, float(volume.radius))
     right, up, back = _pose(table, center)
-    corners = _corners(volume) - center
+    corners = corners - center
     x, y, depth = np.abs(corners @ right), np.abs(corners @ up), corners @ back
     aspect = table.width / table.height
     if isinstance(table, PerspectiveTable):
         half = np.tan(np.radians(table.fov_y / 2))
         distance = np.max(np.maximum(x / (half * aspect), y / half) * MARGIN + depth)
-        pose = look_at(center + distance * back if table.eye is None else table.eye, center, up)
-        return (PerspectiveCamera(pose, table.fov_y, table.width, table.height),)
+        eye = center + distance * back if table.eye is None else table.eye
+        return (PerspectiveCamera.look_at(eye, center, up, table.fov_y, table.width, table.height),)
     extent = 2 * MARGIN * np.max(np.maximum(x / aspect, y)) if table.height_world is None else table.height_world
-    pose = look_at(center + (np.max(depth) + extent) * back if table.eye is None else table.eye, center, up)
-    return (OrthographicCamera(pose, extent, table.width, table.height),)
+    eye = center + (np.max(depth) + extent) * back if table.eye is None else table.eye
+    return (OrthographicCamera.look_at(eye, center, up, extent, table.width, table.height),)
 
 
 def _corners(volume: Volume) -> np.ndarray:
     """World positions of the eight corners of the domain, `(8, 3)`."""
     low, high = volume.domain
     grid = np.array(list(itertools.product(*zip(low, high, strict=True))))
-    matrix = np.asarray(volume.world_from_grid, float)
+    matrix = in_double(volume.world_from_grid, volume.remainder)
     return grid @ matrix[:3, :3].T + matrix[:3, 3]
 
 
