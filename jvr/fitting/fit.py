@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -142,8 +143,14 @@ def fit(
     began = time.perf_counter()
     solver = _as_solver(solver)
     targets = check_images(cameras, images)
+    scene = scene.current()
     model = Exposed(scene, jnp.ones(()) if exposure else None)
     chosen = _choose(model, unknowns, transforms, solver)
+    if any(name.startswith("scene.volume") for name in chosen.names):
+        # What the volume keeps would be that of the start.
+        kept = lambda m: (m.scene.volume.bricks, m.scene.volume.gradients)
+        model = eqx.tree_at(kept, model, (None, None), is_leaf=lambda x: x is None)
+        scene, chosen = model.scene, _choose(model, unknowns, transforms, solver)
     problem = Problem(model, chosen, settings, loss, tuple(priors), None)
     _check(problem, solver)
 

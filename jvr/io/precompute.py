@@ -67,6 +67,7 @@ def precompute(
     environment = scene.environment
     if environment is None:
         return scene
+    scene = scene.current()
     folder = None if cache is None else Path(cache)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)

@@ -171,8 +171,7 @@ def replay(wanted: Any, fixed: Any, noted: Noted, cotangent: Marched) -> Any:
     **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `noted`: by the forward march.
     """
     medium, rays, dt = eqx.combine(wanted, fixed)
-    if jax.tree.leaves(wanted[0].transfer):
-        medium = for_derivatives(medium)
+    medium = for_derivatives(medium, wanted[0], wanted[1:])
     rays_mask = is_there(wanted[1])
     zeros = functools.partial(jax.tree.map, jnp.zeros_like)
 

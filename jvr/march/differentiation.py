@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jvr.march.adjoint import Inputs, is_there, replay_march
 from jvr.march.march import Marched, MarchOptions, march
-from jvr.march.medium import Medium, for_derivatives
+from jvr.march.medium import Medium, taking_all
 from jvr.march.rows import TableRows, table_rows
 from jvr.march.rules import is_zero
 from jvr.march.steps import Rays
@@ -41,7 +41,7 @@ class Forward(AbstractAdjoint):
     through it: use `Replay()`."""
 
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
-        return march(options, for_derivatives(medium), rays, dt)
+        return march(options, taking_all(medium), rays, dt)
 
 
 class Rows(AbstractAdjoint):
@@ -75,7 +75,7 @@ def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[M
     if options.distance or not jax.tree.leaves(entries):
         primal, tangent = march(options, *primals), None
     else:
-        primal, rows = table_rows(options, medium, rays, dt)
+        primal, rows = table_rows(options, medium, rays, dt, of_extinctions=entries.sigma_t is not None)
         tangents = (tangents[0]._replace(transfer=rest_of_transfer), *tangents[1:])
         tangent = _times_entries(rows, entries)
     if jax.tree.leaves(tangents):

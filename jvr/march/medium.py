@@ -8,11 +8,12 @@ import abc
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 from jaxtyping import Array, Bool
 
 from jvr.march.occupancy import Occupancy
 from jvr.march.steps import Point, Sample
-from jvr.model.transfer import Classified
+from jvr.model.transfer import AbstractTable, Classified
 from jvr.types import Channels, Scalar
 
 # Optical depth of a segment, and of a voxel on the way of light, beyond which denser media are lit alike: light gets about as deep into
@@ -86,8 +87,26 @@ class Medium(NamedTuple):
     shadows: AbstractVisibility | None = None
 
 
-def for_derivatives(medium: Medium) -> Medium:
-    """What a march goes through whose derivative with respect to the transfer function is taken: an empty brick may have one, since
-    that of extinction at zero is not zero."""
-    leaps = medium.occupancy is not None and medium.occupancy.in_derivatives
-    return medium if leaps else medium._replace(occupancy=None)
+def for_derivatives(medium: Medium, wanted: Medium, moved: Any = None) -> Medium:
+    """What a march goes through that is differentiated in the leaves of `wanted` that are not `None`, and with `moved`, of rays or steps,
+    in where samples lie.
+
+    An empty brick has a derivative in the extinctions of the transfer function, since that at zero is not zero. In what moves samples or
+    the entries of a table it has one only where that may make it visible, and in anything else, such as colours and light, none.
+    """
+    occupancy, transfer = medium.occupancy, wanted.transfer
+    if occupancy is None or occupancy.is_bounded:
+        return medium
+    is_table = isinstance(transfer, AbstractTable)
+    if jax.tree.leaves(transfer.sigma_t if is_table else transfer):
+        return medium._replace(occupancy=None)
+    of_colours = is_table and transfer.rgb is not None
+    moves = len(jax.tree.leaves((transfer, wanted.field, moved))) > of_colours
+    return medium._replace(occupancy=occupancy.for_slopes()) if moves else medium
+
+
+def taking_all(medium: Medium) -> Medium:
+    """A medium in which nothing that may have a derivative is leapt over, on the way of light neither."""
+    is_occupancy = lambda x: isinstance(x, Occupancy)
+    dropped = lambda x: None if is_occupancy(x) and not x.is_bounded else x
+    return jax.tree.map(dropped, medium, is_leaf=is_occupancy)

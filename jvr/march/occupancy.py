@@ -25,12 +25,22 @@ RADII = (0, 1, 2, 3, 5, 8, 13, 21)
 
 class Occupancy(eqx.Module):
     """`reach[b]`: 0 where brick `b` may be visible, else a number such that every brick nearer than it, by the largest of the three
-    differences of indices, is empty. `size`: voxels along an edge of a brick. `in_derivatives`: whether derivatives with respect to the
-    transfer function leap as well, although that of extinction at zero is not zero."""
+    differences of indices, is empty. `reach_of_slopes`: the same of bricks where extinction has a derivative in the scalar, as at a
+    value that lies where an interval of a table begins to be visible; `None` where `reach` itself is what derivatives leap over. `size`:
+    voxels along an edge of a brick."""
 
     reach: UInt8[Array, "bx by bz"]
+    reach_of_slopes: UInt8[Array, "bx by bz"] | None
     size: int = eqx.field(static=True)
-    in_derivatives: bool = eqx.field(static=True, default=False)
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether what is left out may have some extinction: then derivatives leap over the same, although they are not zero there."""
+        return self.reach_of_slopes is None
+
+    def for_slopes(self) -> "Occupancy":
+        """What derivatives may leap over that have to do with where samples and entries of the transfer function lie."""
+        return self if self.reach_of_slopes is None else Occupancy(self.reach_of_slopes, self.reach_of_slopes, self.size)
 
     def leap(
         self, rays: Rays, u: Float[Array, "rays"], dt: Scalar, *, backwards: bool = False, within: bool = False
@@ -72,36 +82,47 @@ def occupancy_of(
     With a bound `least` on extinction, what is below it is not visible, and derivatives leap over it too.
     """
     slope, intercept, transfer = jax.lax.stop_gradient((slope, intercept, transfer))
-    ends = [slope * bound.astype(slope.dtype) + intercept for bound in (bricks.lower, bricks.upper)]
-    low, high = jnp.minimum(*ends), jnp.maximum(*ends)
+    scaled = [slope * bound.astype(slope.dtype) for bound in (bricks.lower, bricks.upper)]
+    ends = [end + intercept for end in scaled]
     # Interpolated values exceed those they are made of by a few roundings.
-    margin = 8 * jnp.finfo(slope.dtype).eps * jnp.maximum(jnp.abs(low), jnp.abs(high))
-    is_visible = jax.vmap(lambda low, high: transfer.is_visible(low, high, 0.0 if least is None else least))
-    visible = is_visible((low - margin).ravel(), (high + margin).ravel()).reshape(low.shape)
-    return Occupancy(_reach(~(visible | jnp.isnan(low + high))), bricks.size, in_derivatives=least is not None)
+    margin = 8 * jnp.finfo(slope.dtype).eps * (jnp.maximum(*map(jnp.abs, scaled)) + jnp.abs(intercept))
+    low, high = jnp.minimum(*ends) - margin, jnp.maximum(*ends) + margin
+
+    def empty(nearby: bool) -> Bool[Array, "bx by bz"]:
+        is_visible = jax.vmap(lambda low, high: transfer.is_visible(low, high, 0.0 if least is None else least, nearby=nearby))
+        return ~(is_visible(low.ravel(), high.ravel()).reshape(low.shape) | jnp.isnan(low + high))
+
+    if least is not None:
+        (reach,) = _reaches(empty(nearby=True))
+        return Occupancy(reach, None, bricks.size)
+    reach, reach_of_slopes = _reaches(empty(nearby=False), empty(nearby=True))
+    return Occupancy(reach, reach_of_slopes, bricks.size)
 
 
-def _reach(empty: Bool[Array, "bx by bz"]) -> UInt8[Array, "bx by bz"]:
-    """One more than the radius of the largest cube of empty bricks, of `RADII`, around each; beyond the volume all is empty.
+def _reaches(*empty: Bool[Array, "bx by bz"]) -> list[UInt8[Array, "bx by bz"]]:
+    """For each array one more than the radius of the largest cube of empty bricks, of `RADII`, around each; beyond the volume all is empty.
 
     A cube of radius `r + s` is the union of cubes of radius `r` around bricks `s` apart, as long as `s <= 2 r + 1`.
     """
+    # A bit for each of the arrays, so that all of them take one walk through memory.
+    bits = sum((e.astype(jnp.uint8) << i for i, e in enumerate(empty)), jnp.uint8(0))
     # Else each of the two bricks that an erosion looks at is classified anew; where none is empty, zeros say the same.
-    empty = computed_once(empty, empty)
-    reach = empty.astype(jnp.uint8)
+    bits = computed_once(bits > 0, bits)
+    of = lambda i: (bits >> i & 1) > 0
+    reaches = [of(i).astype(jnp.uint8) for i in range(len(empty))]
     for radius, larger in itertools.pairwise(RADII):
         for axis in range(3):
-            empty = _erode(empty, axis, larger - radius)
-        empty = computed_once(empty, empty)
-        reach = jnp.where(empty, jnp.uint8(larger + 1), reach)
-    return reach
+            bits = _erode(bits, axis, larger - radius)
+        bits = computed_once(bits > 0, bits)
+        reaches = [jnp.where(of(i), jnp.uint8(larger + 1), reach) for i, reach in enumerate(reaches)]
+    return reaches
 
 
-def _erode(empty: Bool[Array, "bx by bz"], axis: int, shift: int) -> Bool[Array, "bx by bz"]:
-    """Which elements, and both of those `shift` from them along an axis, are true."""
-    n = empty.shape[axis]
+def _erode(bits: UInt8[Array, "bx by bz"], axis: int, shift: int) -> UInt8[Array, "bx by bz"]:
+    """Which bits of elements, and of both of those `shift` from them along an axis, are set."""
+    n = bits.shape[axis]
     padding = [(0, 0)] * 3
     padding[axis] = (shift, shift)
-    padded = jnp.pad(empty, padding, constant_values=True)
+    padded = jnp.pad(bits, padding, constant_values=255)
     before, after = (jax.lax.slice_in_dim(padded, at, at + n, axis=axis) for at in (0, 2 * shift))
-    return empty & before & after
+    return bits & before & after

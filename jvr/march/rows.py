@@ -12,6 +12,7 @@ the table.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -34,7 +35,8 @@ class TableRows(NamedTuple):
     """Rows of the Jacobian of a march. Each is `(rays, entries)`, for one channel of radiance or optical depth.
 
     `radiance_rgb[c]`, `radiance_sigma[c]`: of radiance channel `c` with respect to column `c` of the colours, and to the extinctions
-    (column `c` of them where they are coloured); `tau_sigma[c]`: of optical depth `c` with respect to the extinctions.
+    (column `c` of them where they are coloured); `tau_sigma[c]`: of optical depth `c` with respect to the extinctions. Those of
+    extinctions are empty where nobody asks for them.
     """
 
     radiance_rgb: tuple[Float[Array, "rays n"], ...]
@@ -48,28 +50,33 @@ class _RowState(NamedTuple):
     rows: TableRows
 
 
-def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> tuple[Marched, TableRows]:
-    """The march of `jvr.march.march.march` and its rows with respect to the entries of `medium.transfer`, an `AbstractTable`.
+def table_rows(
+    options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar, *, of_extinctions: bool = True
+) -> tuple[Marched, TableRows]:
+    """The march of `jvr.march.march.march` and its rows with respect to the entries of `medium.transfer`, an `AbstractTable`: colours and,
+    unless not `of_extinctions`, extinctions.
 
     Distances have no rows. Memory: `rays x entries` numbers for each row that `TableRows` lists. Detached as in `march`.
     """
-    medium = for_derivatives(medium)
     gathered, noted = integrate(options, medium, rays, dt, for_replay=True)
     assert isinstance(medium.transfer, AbstractTable)
     assert noted is not None
+    wanted = jax.tree.map(lambda _: None, medium)
+    of_entries = (lambda m: (m.transfer.rgb, m.transfer.sigma_t)) if of_extinctions else lambda m: m.transfer.rgb
+    medium = for_derivatives(medium, eqx.tree_at(of_entries, wanted, of_entries(medium), is_leaf=lambda x: x is None))
     n = medium.transfer.rgb.shape[0]
     emits, absorbs = len(gathered.radiance), len(noted.front)
 
     def start(back: BackLanes) -> _RowState:
         zero = jnp.zeros((back.steps.size, n), rays.length.dtype)
-        rows = TableRows((zero,) * emits, (zero,) * emits, (zero,) * absorbs)
+        rows = TableRows((zero,) * emits, (zero,) * emits * of_extinctions, (zero,) * absorbs * of_extinctions)
         return _RowState(back.nothing_behind(emits, distance=False), jnp.zeros_like(back.steps), rows)
 
     def alive(back: BackLanes, state: _RowState):
         return state.j < back.steps
 
     def advance(back: BackLanes, state: _RowState, _: None) -> tuple[_RowState, None]:
-        one = lambda carry, _: _row_segment(medium, dt, back, *carry)
+        one = lambda carry, _: _row_segment(medium, dt, back, of_extinctions, *carry)
         (behind, j), (u, weights) = jax.lax.scan(one, (state.behind, state.j), length=BLOCK)
         entry = jnp.arange(n, dtype=u.dtype)
         hats = [jnp.maximum(0.0, 1.0 - jnp.abs(u[i][:, None] - entry)) for i in range(BLOCK)]
@@ -81,7 +88,7 @@ def table_rows(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) ->
     return gathered, rows
 
 
-def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, behind: Behind, j: Int[Array, "rays"]):
+def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, of_extinctions: bool, behind: Behind, j: Int[Array, "rays"]):
     """One segment of every ray: the state before it, where its samples fall in the table, and the weights of their hats."""
     j = back.leap(medium, dt, j)
     lanes, (k, count) = back.lanes, back.at(j)
@@ -110,10 +117,10 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, behind: Behind, j:
         (of_entry,) = pull(segment_cotangents(one, behind, before, dtau, distance)[:2])
         radiance_rgb.append(of_entry.rgb[c])
         radiance_sigma.append(of_entry.sigma_t[c % len(of_entry.sigma_t)])
-    for c in range(len(dtau)):
+    for c in range(len(dtau) * of_extinctions):
         (of_entry,) = pull(((zero,) * len(emitted), _only(nothing.tau, c)))
         tau_sigma.append(of_entry.sigma_t[c])
-    weights = TableRows(tuple(radiance_rgb), tuple(radiance_sigma), tuple(tau_sigma))
+    weights = TableRows(tuple(radiance_rgb), tuple(radiance_sigma) * of_extinctions, tuple(tau_sigma))
     assert isinstance(medium.transfer, AbstractTable)
     u = jax.vmap(medium.transfer.coordinate)(samples.s)
     return (step_back(behind, front, emitted, dtau, distance), j + (j < back.steps)), (u, weights)

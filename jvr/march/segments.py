@@ -65,7 +65,7 @@ def first_visible(medium: Medium, lanes: Lanes, dt: Scalar) -> Int[Array, "rays"
 def shown(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]) -> Int[Array, "rays"]:
     """`count`, the number of segments, and 0 for rays whose segment `k` is not to be seen. A leap may end in another empty brick; where
     empty means negligible, both directions have to take the same segments."""
-    if medium.occupancy is None or not medium.occupancy.in_derivatives:
+    if medium.occupancy is None or not medium.occupancy.is_bounded:
         return count
     _, u = segment(k, count, lanes.rays.length, dt)
     return jnp.where(medium.occupancy.shows(lanes.rays, u), count, 0)
@@ -118,14 +118,21 @@ def lit(medium: Medium, where: Stretch, samples: tuple[Sample, ...], *, reverse:
     if medium.shadows is None:
         return samples
     shader, middle = medium.shader, points_at(where.rays, where.ray, where.k, where.u)
-    classify = lambda sample, point: shader.classify(medium.transfer, shader.prepare(medium.transfer, sample, point)).sigma_t
-    sigma_t = [sigma for sample in samples for sigma in jax.vmap(classify)(sample, middle)]
-    light = light_at(medium, where, sigma_t, reverse=reverse)
+
+    def classify(sample: Sample, point: Point) -> tuple[Channels, Channels]:
+        """Extinction, and on the way back how it changes with the scalar."""
+        of = lambda s: shader.classify(medium.transfer, shader.prepare(medium.transfer, sample._replace(s=s), point)).sigma_t
+        return jax.jvp(of, (sample.s,), (jnp.ones_like(sample.s),)) if reverse else (of(sample.s), ())
+
+    sigma_t, slopes = zip(*(jax.vmap(classify)(sample, middle) for sample in samples), strict=True)
+    light = light_at(medium, where, sum(sigma_t, ()), reverse=reverse, slopes=sum(slopes, ()))
     return tuple(sample._replace(light=light) for sample in samples)
 
 
-def light_at(medium: Medium, where: Stretch, sigma_t: Sequence[Array], *, reverse: bool) -> tuple[Channels, ...]:
-    """How much light reaches a segment with these extinctions.
+def light_at(
+    medium: Medium, where: Stretch, sigma_t: Sequence[Array], *, reverse: bool, slopes: Sequence[Array] = ()
+) -> tuple[Channels, ...]:
+    """How much light reaches a segment with these extinctions, and these changes of them with the scalar.
 
     It is looked up where the segment's own emission comes from on average, in front of its middle: in the middle of an opaque one it
     is dark, though its front is not.
@@ -134,10 +141,11 @@ def light_at(medium: Medium, where: Stretch, sigma_t: Sequence[Array], *, revers
     dtau = jnp.minimum(sum(sigma_t[1:], sigma_t[0]) / len(sigma_t) * where.extent, DENSEST)
     u = computed_once(where.inside, where.u + where.extent * (mean_depth(dtau) - 0.5))
     points = points_at(where.rays, where.ray, where.k, u)
-    # Without extinction there is nothing to see; but where nothing is left out it has a derivative, and between the ends of a segment
-    # there may be what is at neither.
+    # Without extinction there is nothing to see; but where it begins, or nothing is left out, it has a derivative, and between the ends of
+    # a segment there may be what is at neither.
     everywhere = medium.occupancy is None or len(medium.shader.places) > 1
-    wanted = where.inside if everywhere else where.inside & functools.reduce(jnp.logical_or, [sigma != 0 for sigma in sigma_t])
+    shows = functools.reduce(jnp.logical_or, [x != 0 for x in (*sigma_t, *slopes)])
+    wanted = where.inside if everywhere else where.inside & shows
     return computed_once(where.inside, medium.shadows.transmittances(points, wanted, reverse=reverse))
 
 

@@ -1,8 +1,10 @@
 """Smallest and largest voxel of each brick of a volume."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Shaped
 
@@ -34,11 +36,15 @@ def bricks_of(values: Voxels, size: int = 4) -> Bricks:
 
 
 def _along(values: Array, axis: int, size: int, extreme: Any) -> Array:
-    """Extremes of each run of `size + 1` voxels along an axis, runs sharing their ends."""
+    """Extremes of each run of `size + 1` voxels along an axis, runs sharing their ends; the last one may be shorter."""
     n = values.shape[axis]
     count = max(1, -(-(n - 1) // size))
-    padding = [(0, 0)] * 3
-    padding[axis] = (0, count * size + 1 - n)
-    values = jnp.moveaxis(jnp.pad(values, padding, mode="edge"), axis, 0)
-    runs = values[:-1].reshape(count, size, *values.shape[1:])
-    return jnp.moveaxis(extreme(extreme.reduce(runs, axis=1), values[size::size]), 0, axis)
+    last = jax.lax.slice_in_dim(values, n - 1, n, axis=axis)
+
+    def voxel(i: int) -> Array:
+        """The `i`-th voxel of each run. The array is not padded, which would copy it: what is missing is what the last run ends with."""
+        some = jax.lax.slice_in_dim(values, min(i, n), n, stride=size, axis=axis)
+        some = jax.lax.slice_in_dim(some, 0, min(count, some.shape[axis]), axis=axis)
+        return jnp.concatenate([some, *[last] * (count - some.shape[axis])], axis=axis)
+
+    return functools.reduce(extreme, [voxel(i) for i in range(size + 1)])

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import float_array, require
 from jvr.model.ranges import EXTINCTION, NOT_NEGATIVE, SHARE, Increasing, within
-from jvr.model.transfer import AbstractTransfer, Classified
+from jvr.model.transfer import AbstractTransfer, Classified, any_between
 from jvr.types import ArrayLike, Channels, Scalar
 
 
@@ -52,12 +52,13 @@ class GradientTransfer(AbstractTransfer):
         r, g, b, *sigma_t = sum(rows[1:], rows[0])
         return Classified((r, g, b), tuple(sigma_t))
 
-    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
+        # Whatever the length of the gradient: it depends on voxels farther away, too.
         n = self.rgb.shape[0]
         lit = jnp.any(~(jnp.abs(self.sigma_t.reshape(n, -1)) <= least), axis=1)
-        before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(lit, dtype=jnp.int32)])
-        first, last = (_cell(s, self.domain, n)[0] for s in (low, high))
-        return before[jnp.minimum(last + 2, n)] > before[first]
+        beyond = high < self.domain[0], low > self.domain[1]
+        u, v = (_coordinate(s, self.domain, n) for s in (low, high))
+        return any_between(lit, u, v, beyond if nearby else None)
 
 
 class GradientOpacity(AbstractTransfer):
@@ -89,12 +90,17 @@ class GradientOpacity(AbstractTransfer):
         scaled: Channels = tuple(sigma * share for sigma in sigma_t)
         return Classified(rgb, scaled)
 
-    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
-        return self.transfer.is_visible(low, high, least)
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
+        return self.transfer.is_visible(low, high, least, nearby=nearby)
 
 
 def _cell(x: Scalar, domain: Float[Array, "2"], n: int) -> tuple[Array, Scalar]:
     """The interval of `n - 1` that a value falls into, and where in it."""
-    at = jnp.clip((x - domain[0]) * ((n - 1) / (domain[1] - domain[0])), 0, n - 1)
+    at = _coordinate(x, domain, n)
     low = jnp.clip(jnp.floor(at), 0, n - 2)
     return low.astype(jnp.int32), at - low
+
+
+def _coordinate(x: Scalar, domain: Float[Array, "2"], n: int) -> Scalar:
+    """Where a value falls between `n` entries, 0 ... n-1, clamped."""
+    return jnp.clip((x - domain[0]) * ((n - 1) / (domain[1] - domain[0])), 0, n - 1)

@@ -89,6 +89,11 @@ class Scene(eqx.Module):
         _check_light(self)
         _check_environment(self)
 
+    def current(self) -> "Scene":
+        """The same scene with `Volume.current()`: what draws it begins here."""
+        volume = self.volume.current()
+        return self if volume is self.volume else eqx.tree_at(lambda s: s.volume, self, volume)
+
     @property
     def material_order(self) -> int:
         """`material_order` of its environment and radiance transfer; 0 without an environment."""

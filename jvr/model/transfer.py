@@ -34,8 +34,12 @@ class AbstractTransfer(eqx.Module):
         """Colour and extinction at one scalar value; traceable and differentiable in `s` and in every array."""
 
     @abc.abstractmethod
-    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
-        """Whether any value from `low` to `high` may have extinction above `least`; never falsely `False`."""
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
+        """Whether any value from `low` to `high` may have extinction above `least`; never falsely `False`.
+
+        With `nearby`, whether any may however little it is changed: where none is, extinction has no derivative in the value nor in
+        where entries lie.
+        """
 
 
 class AbstractTable(AbstractTransfer):
@@ -44,16 +48,19 @@ class AbstractTable(AbstractTransfer):
     rgb: eqx.AbstractVar[Float[Array, "n 3"]]
     sigma_t: eqx.AbstractVar[Float[Array, "..."]]
 
+    @property
+    @abc.abstractmethod
+    def ends(self) -> tuple[Scalar, Scalar]:
+        """Scalar values of the first and the last entry."""
+
     @abc.abstractmethod
     def coordinate(self, s: Scalar) -> Scalar:
         """Where `s` falls in the table, 0 ... n-1, clamped; entry `i` has weight `max(0, 1 - |coordinate - i|)`."""
 
-    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
-        # Entries above the bound are counted: a difference of sums of the extinctions themselves would round small ones away.
-        lit = ~(jnp.abs(self.sigma_t.reshape(self.sigma_t.shape[0], -1)) <= least)
-        before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(jnp.any(lit, axis=1), dtype=jnp.int32)])
-        first, last = (jnp.floor(self.coordinate(s)).astype(jnp.int32) for s in (low, high))
-        return before[jnp.minimum(last + 2, before.size - 1)] > before[first]
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
+        lit = jnp.any(~(jnp.abs(self.sigma_t.reshape(self.sigma_t.shape[0], -1)) <= least), axis=1)
+        beyond = high < self.ends[0], low > self.ends[1]
+        return any_between(lit, self.coordinate(low), self.coordinate(high), beyond if nearby else None)
 
 
 class LinearTransfer(AbstractTable):
@@ -78,6 +85,10 @@ class LinearTransfer(AbstractTable):
             jnp.diff(self.positions), lambda d: d > 0, "positions must be strictly increasing: sort them and remove duplicates"
         )
         self.rgb, self.sigma_t = _colour(rgb, n), _extinction(sigma_t, n)
+
+    @property
+    def ends(self) -> tuple[Scalar, Scalar]:
+        return self.positions[0], self.positions[-1]
 
     def coordinate(self, s: Scalar) -> Scalar:
         n = self.positions.shape[0]
@@ -115,6 +126,10 @@ class LutTransfer(AbstractTable):
     def positions(self) -> Float[Array, "n"]:
         """Scalar value of each entry."""
         return jnp.linspace(self.domain[0], self.domain[1], self.rgb.shape[0])
+
+    @property
+    def ends(self) -> tuple[Scalar, Scalar]:
+        return self.domain[0], self.domain[1]
 
     def coordinate(self, s: Scalar) -> Scalar:
         last = self.rgb.shape[0] - 1
@@ -165,11 +180,30 @@ class GaussianTransfer(AbstractTransfer):
         weight = divide_or_zero(weight, jnp.broadcast_to(jnp.sum(weight), weight.shape))
         return Classified(_three(self.rgb.T @ weight), sigma_t)
 
-    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
-        # The largest extinction of each Gaussian in the range: at its centre, or at the end nearer to it. Zero is where it underflows.
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
+        # The largest extinction of each Gaussian in the range: at its centre, or at the end nearer to it. Zero is where it underflows,
+        # and so does its derivative.
         nearest = jnp.clip(self.center, low, high)
         height = self.height if self.height.ndim == 1 else jnp.max(self.height, axis=1)
         return ~(jnp.sum(jnp.abs(height) * jnp.exp(-0.5 * jnp.square((nearest - self.center) / self.width))) <= least)
+
+
+def any_between(
+    lit: Bool[Array, "n"], u: Scalar, v: Scalar, beyond: tuple[Bool[Array, ""], Bool[Array, ""]] | None
+) -> Bool[Array, ""]:
+    """Whether any entry is `lit` that has a weight in a table's coordinates `u` ... `v`, both clamped to 0 ... n-1.
+
+    Where `beyond` says whether what was clamped lies in front of the first entry and behind the last one, also those that have one next
+    to `u` and `v`: at an entry both of its neighbours, beyond an end none.
+    """
+    n = lit.shape[0]
+    first, last = jnp.floor(u), jnp.ceil(v)
+    if beyond is not None:
+        first = jnp.where(beyond[1], n - 1, jnp.maximum(jnp.ceil(u) - 1, 0))
+        last = jnp.where(beyond[0], 0, jnp.minimum(jnp.floor(v) + 1, n - 1))
+    # Entries are counted: a difference of sums of the extinctions themselves would round small ones away.
+    before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(lit, dtype=jnp.int32)])
+    return before[last.astype(jnp.int32) + 1] > before[first.astype(jnp.int32)]
 
 
 def _colour(rgb: ArrayLike, n: int) -> Float[Array, "n 3"]:

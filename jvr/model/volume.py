@@ -7,11 +7,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder
+from jvr.model.kept import is_made_of, note_sources
 from jvr.model.packing import Squares, squares_of
 from jvr.numerics import add_runs, read_at, read_run, transformed, turned
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
@@ -77,7 +79,8 @@ class Volume(eqx.Module):
     - `remainder`: of a `world_from_grid` that JAX holds already: what single precision leaves of one that was given in double precision
       (see `jvr.model.exact`). Positions of cameras, lights and clipping boxes are taken relative to the volume before they are rounded.
 
-    `bricks` is `None` until `bricked()` makes them.
+    `bricks`, `squares` and `gradients` are `None` until `bricked()`, `packed()` and `graded()` make them. What has been replaced since is
+    never seen in their place: `current()` makes them anew where they are not known to belong to the voxels.
 
     **Raises** `ValueError` for another number of dimensions, an empty array or a singular transform, `TypeError` for voxels
     that are not real numbers. Everything but `interpolation` is an array and differentiable.
@@ -125,13 +128,13 @@ class Volume(eqx.Module):
 
     def bricked(self, size: int = 4) -> "Volume":
         """The same volume with the bounds of its bricks of `size^3` voxels, which empty-space skipping needs; without them each
-        picture computes them anew. They take `2 / size^3` of the voxels' memory.
-
-        They belong to these voxels: after replacing `values`, call it again. **Raises** `ValueError` where `size` is below 1.
+        picture computes them anew, as it does inside of `jit` where voxels are an argument (`current`). They take `2 / size^3` of the
+        voxels' memory. **Raises** `ValueError` where `size` is below 1.
         """
         if isinstance(size, bool) or not isinstance(size, int) or size < 1:
             raise ValueError(f"the size of a brick must be a positive whole number of voxels, not {size!r}; 4 is a good start")
-        bricks = jax.jit(bricks_of, static_argnums=1)(jax.lax.stop_gradient(self.values), size)
+        bricks = _bricks(jax.lax.stop_gradient(self.values), size)
+        note_sources(bricks.lower, self.values)
         return eqx.tree_at(lambda v: v.bricks, self, bricks, is_leaf=lambda x: x is None)
 
     def packed(self) -> "Volume":
@@ -139,22 +142,49 @@ class Volume(eqx.Module):
 
         `uint8` voxels are kept as they are. Others are rounded to 256 levels between the smallest and the largest of them, an error of
         at most 1/510 of that range, and are no longer differentiable; `slope` and `intercept` make up for it, so that `s` means the same.
-        They belong to these voxels: after replacing `values`, call it again. **Raises** `ValueError` unless interpolation is trilinear.
+        **Raises** `ValueError` unless interpolation is trilinear.
         """
         if not isinstance(self.interpolation, Trilinear):
             raise ValueError("only trilinear interpolation reads packed voxels: set Volume(interpolation=jvr.Trilinear())")
         volume = self if self.values.dtype == jnp.uint8 else _quantised(self)
-        squares = jax.jit(squares_of)(volume.values)
-        return eqx.tree_at(lambda v: v.squares, volume, squares, is_leaf=lambda x: x is None)
+        squares = _squares(volume.values)
+        note_sources(squares.entries, volume.values)
+        return eqx.tree_at(lambda v: v.squares, volume, squares, is_leaf=lambda x: x is None).current()
 
     def graded(self) -> "Volume":
         """The same volume with the gradients at its voxels, which `jvr.PrecomputedGradient()` interpolates; without them each picture
-        computes them anew. They take 12 bytes a voxel, and are constants: where the voxels are to be fitted, leave them out.
+        computes them anew, as it does where voxels, slope or intercept are differentiated or arguments of `jit` (`current`). They take
+        12 bytes a voxel."""
+        gradients = _gradients(self.values, self.slope, self.intercept)
+        note_sources(gradients, self.values, self.slope, self.intercept)
+        return eqx.tree_at(lambda v: v.gradients, self, gradients, is_leaf=lambda x: x is None)
 
-        They belong to these voxels: after replacing `values`, call it again.
+    def current(self) -> "Volume":
+        """The same volume with what it keeps made anew where voxels, slope or intercept are not the very arrays that it was made of.
+
+        What draws a volume begins here, so that a part may be replaced like any other. Arrays at hand are told apart by identity, at no
+        cost. Traced ones are not: there bricks and gradients are made for each picture, the latter with their derivative, and squares
+        where they do not hold the voxels.
         """
-        values = jax.lax.stop_gradient(self.values.astype(self.slope.dtype) * self.slope + self.intercept)
-        return eqx.tree_at(lambda v: v.gradients, self, jax.jit(gradients_at_voxels)(values), is_leaf=lambda x: x is None)
+        if any(isinstance(x, Tracer) for x in (self.values, self.slope, self.intercept)):
+            return self._current()
+        # Within a traced function that closes over them they are constants, and the compiler would take seconds to fold all of this.
+        with jax.ensure_compile_time_eval():
+            return self._current()
+
+    def _current(self) -> "Volume":
+        volume = self
+        if self.bricks is not None and not is_made_of(self.bricks.lower, self.values):
+            volume = volume.bricked(self.bricks.size)
+        if self.gradients is not None and not is_made_of(self.gradients, self.values, self.slope, self.intercept):
+            volume = volume.graded()
+        if self.squares is None or is_made_of(self.squares.entries, self.values):
+            return volume
+        fits = self.values.dtype == jnp.uint8 and self.values.shape == self.squares.entries.shape
+        squares = _squares_if_other(self.values, self.squares) if fits else None
+        if squares is not None:
+            note_sources(squares.entries, self.values)
+        return eqx.tree_at(lambda v: v.squares, volume, squares)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -270,6 +300,22 @@ def gradients_at_voxels(values: Float[Array, "x y z"]) -> Float[Array, "x y z 3"
     return jnp.stack([jnp.asarray(g) for g in along], axis=-1)
 
 
+_bricks = jax.jit(bricks_of, static_argnums=1)
+_squares = jax.jit(squares_of)
+
+
+@jax.jit
+def _gradients(values: Voxels, slope: Scalar, intercept: Scalar) -> Float[Array, "x y z 3"]:
+    return gradients_at_voxels(values.astype(slope.dtype) * slope + intercept)
+
+
+@jax.jit
+def _squares_if_other(values: Voxels, squares: Squares) -> Squares:
+    """The squares of these voxels: those at hand where they hold the same."""
+    same = jnp.all((squares.entries & 255).astype(jnp.uint8) == values)
+    return jax.lax.cond(same, lambda: squares, lambda: squares_of(values))
+
+
 def _quantised(volume: Volume) -> Volume:
     """The volume with `uint8` voxels."""
     values = jax.lax.stop_gradient(volume.values).astype(volume.slope.dtype)
@@ -277,8 +323,7 @@ def _quantised(volume: Volume) -> Volume:
     scale = jnp.where(high > low, (high - low) / 255, 1.0)
     levels = jnp.round((values - low) / scale).astype(jnp.uint8)
     slope, intercept = volume.slope * scale, volume.slope * low + volume.intercept
-    parts = lambda v: (v.values, v.slope, v.intercept, v.bricks)
-    return eqx.tree_at(parts, volume, (levels, slope, intercept, None), is_leaf=lambda x: x is None)
+    return eqx.tree_at(lambda v: (v.values, v.slope, v.intercept), volume, (levels, slope, intercept))
 
 
 class ClippingBox(eqx.Module):

@@ -64,7 +64,7 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
     if scene.radiance_transfer is not None and not is_traced(scene):
         for problem in scene.radiance_transfer.outdated(scene.transfer, scene.material):
             warnings.warn(problem, RuntimeWarning, stacklevel=2)
-    return settings.sampling.render(scene, camera, settings)
+    return settings.sampling.render(scene.current(), camera, settings)
 
 
 def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> Rendering:
