@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jvr
-from experiments import contact_sheet, phase_recovery, relight, shadowed_fit
+from experiments import contact_sheet, convergence, phase_recovery, relight, shadowed_fit
 from jvr.io.config import build_fit, build_scene, read_config
 
 
@@ -138,3 +138,16 @@ def test_relighting_runs(monkeypatch, tmp_path):
     assert exact["determined"] == 12
     assert exact["coefficients"] < without["coefficients"]
     assert all(exact[key]["psnr"] > without[key]["psnr"] for key in ("held_out", "relit"))
+
+
+@pytest.mark.slow
+def test_convergence_runs_beside_scipy(monkeypatch, tmp_path):
+    report, size = ran(convergence, monkeypatch, tmp_path)
+    assert size > 1000
+    assert set(report) == {"random", "noise"}
+    for found in report.values():
+        assert found["at_bottom"] == 1
+        assert found["falsely_converged"] == 0
+        assert len(found["jvr"]) == 2
+        # The compression keeps the length of the residual: SciPy's error is that of its table.
+        assert found["scipy"][0]["mse"] >= 0.99 * found["best"]
