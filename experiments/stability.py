@@ -183,13 +183,82 @@ def rows(quick: bool = False) -> dict[str, list[Case]]:
         "deep shadow map with one layer": [
             base(sigma=f, shadows=jvr.DeepShadowMap(12, 1), label=f"{f:g}") for f in pick([1e-3, 1.0, 1e4])
         ],
-    }
+    } | placed_rows(quick)
     if not quick:
         for shadows in (jvr.ShadowVolume(1.0), jvr.OpacityShadowMap(9, 7), jvr.DeepShadowMap(9, 7)):
             cases = [base(sigma=f, shadows=shadows, label=f"depth {f:g}") for f in (0.0, 1.0, 1e4, 1e8)]
             cases += [base(**unit, lights=point(*p), shadows=shadows, label=str(p)) for p in ((2, 2.5, 3), (2.2, 2.7, 3.4))]
             found[f"{type(shadows).__name__}: optical depth 0 ... 1e8, light inside"] = cases
     return found | natural_rows(quick)
+
+
+def smooth() -> np.ndarray:
+    """Voxels without kinks of note."""
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, n) for n in SHAPE], indexing="ij")
+    return 0.5 + 0.4 * np.sin(2 * x + 1) * np.cos(1.5 * y) * np.cos(1.2 * z + 0.3)
+
+
+def placed(
+    *,
+    away: float = 2.6,
+    origin: Any = (0.0, 0.0, 0.0),
+    clip: bool = False,
+    values: np.ndarray | None = None,
+    label: str = "",
+    **parts: Any,
+) -> Case:
+    """Smooth voxels, that of index (0, 0, 0) at `origin`, seen from `away` of the volume's radii under the same angle."""
+    matrix = oblique()
+    matrix[:3, 3] = origin
+    values = smooth() if values is None else values
+    center = matrix[:3, :3] @ ((np.array(SHAPE) - 1) / 2) + origin
+    radius = float(jvr.Volume(values, oblique()).radius)
+    lights = (
+        jvr.DirectionalLight([0.5, 0.4, -0.6], [0.6, 0.8, 0.5]),
+        jvr.PointLight(center + radius * np.array([0.8, 1.1, 0.4]), 2 * radius**2),
+    )
+    case = base(values=values, world=matrix, lights=lights, label=label, **parts)
+    eye = center + away * radius * np.array([0.8, -0.48, 0.36])
+    angle = 2 * math.degrees(math.atan(2.6 * math.tan(math.radians(19)) / away))
+    scene = case.scene
+    if clip:
+        scene = dataclasses.replace(scene, clipping=jvr.ClippingBox(center - 0.45 * radius, center + 0.37 * radius))
+    return Case(label, scene, jvr.PerspectiveCamera.look_at(eye, center, [0.1, 0.2, 1.0], angle, 6, 5))
+
+
+def placed_rows(quick: bool) -> dict[str, list[Case]]:
+    """Hard cases of where things are: cameras far away, worlds with a far origin, cuts, and voxels that are no numbers."""
+    pick = lambda values: values[:: max(1, len(values) // 2)] if quick else values
+    unknown = 0.1 + 0.8 * np.random.default_rng(0).random(SHAPE)
+    unknown[2:] = -3.4e38
+    missing = np.random.default_rng(0).random(SHAPE)
+    missing[0, 0, 0] = np.nan
+    # The clipping box keeps the voxel that is NaN away from every ray.
+    hidden = base(values=missing, world=np.eye(4), label="NaN")
+    box = jvr.ClippingBox([1.25, 1.25, 1.25], [9.0, 9.0, 9.0])
+    hidden = hidden._replace(scene=dataclasses.replace(hidden.scene, clipping=box))
+    # Equal voxels but for a noise.
+    noisy = lambda noise: 0.5 * (1 + noise * np.random.default_rng(0).standard_normal(SHAPE))
+    labels = placed(label="two labels")
+    volume = jvr.Volume((smooth() > 0.5).astype(np.uint8), oblique(), interpolation=jvr.Nearest())
+    labels = labels._replace(scene=dataclasses.replace(labels.scene, volume=volume), kink=True)
+    spot = lambda outer: (
+        jvr.DirectionalLight([0.5, 0.4, -0.6], [0.6, 0.8, 0.5]),
+        jvr.SpotLight([4.0, 9.0, 8.0], [-0.5, -1.0, -0.8], 200.0, inner=0.3 * outer, outer=outer),
+    )
+    return {
+        "camera 10 ... 1e6 radii away": [placed(away=d, label=f"{d:g}") for d in pick([10.0, 1e2, 1e4, 1e6])],
+        "world origin as in UTM": [
+            placed(origin=(759186.3, -2957195.7, 1203.1), away=d, clip=True, label=f"{d:g}") for d in pick([2.6, 1e4])
+        ],
+        "cut by a clipping box, noise 0 ... 1e-3": [
+            placed(values=noisy(noise), clip=True, label=f"{noise:g}") for noise in pick([0.0, 1e-6, 1e-3])
+        ],
+        "labels": [labels],
+        "voxel (0, 0, 0) is NaN, and clipped": [hidden],
+        "no data: voxels of -3.4e38": [base(values=unknown, world=np.eye(4), label="-3.4e38")],
+        "spot of 0.01 ... 60 degrees": [base(world=np.eye(4), lights=spot(a), label=f"{a:g}") for a in pick([0.01, 1.0, 60.0])],
+    }
 
 
 def natural(
@@ -302,7 +371,7 @@ def measured(case: Case, ways: Ways, *, modes: bool = True) -> Found:
             g, t, x = g[:3], t[:3], x[:3]
         if case.kink and any(part in label for part in ("world_from", "position", "direction", "fov")):
             continue
-        least = FELT * float(np.sum(np.abs(true_rgb))) / max(float(np.abs(x).max()), 1e-30)
+        least = FELT * float(np.sum(np.abs(true_rgb))) / max(float(np.nanmax(np.abs(x))), 1e-30)
         if "fov" in label:
             least = max(least, pose)
         error = float(np.abs(g.astype(float) - t).max() / max(float(np.abs(t).max()), least))
