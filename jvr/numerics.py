@@ -123,6 +123,20 @@ def power_of_cosine(a: Triple, b: Triple, exponent: Float[Array, "..."]) -> Floa
     return jnp.where(positive, jnp.exp(exponent * jnp.log1p(-jnp.where(positive, gap, 0.0))), 0.0)
 
 
+def larger(a: Float[Array, "..."], b: Float[Array, "..."] | float) -> Float[Array, "..."]:
+    """The larger of two numbers; where they are equal the derivative is that of `a`.
+
+    `jnp.maximum` finds whose derivative it has by asking which of the two equals the result. Where the compiler computes a number anew
+    for that, and rounds it otherwise, neither does, and the derivative is lost.
+    """
+    return jnp.where(a < b, b, a)
+
+
+def smaller(a: Float[Array, "..."], b: Float[Array, "..."] | float) -> Float[Array, "..."]:
+    """The smaller of two numbers; else as `larger`."""
+    return jnp.where(a > b, b, a)
+
+
 def ray_box(origin: Triple, direction: Triple, lower: Corner, upper: Corner) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Distances at which a ray enters and leaves an axis-aligned box (slab method, Kay and Kajiya 1986).
 
@@ -138,9 +152,9 @@ def ray_box(origin: Triple, direction: Triple, lower: Corner, upper: Corner) -> 
         inverse = 1.0 / jnp.where(parallel, 1.0, d)
         first, second = (low - o) * inverse, (high - o) * inverse
         inside = (o >= low) & (o <= high)
-        enter = jnp.where(parallel, jnp.where(inside, -jnp.inf, jnp.inf), jnp.minimum(first, second))
-        leave = jnp.where(parallel, jnp.where(inside, jnp.inf, -jnp.inf), jnp.maximum(first, second))
-        t_near, t_far = jnp.maximum(t_near, enter), jnp.minimum(t_far, leave)
+        enter = jnp.where(parallel, jnp.where(inside, -jnp.inf, jnp.inf), smaller(first, second))
+        leave = jnp.where(parallel, jnp.where(inside, jnp.inf, -jnp.inf), larger(first, second))
+        t_near, t_far = larger(t_near, enter), smaller(t_far, leave)
     return t_near, t_far
 
 

@@ -442,6 +442,14 @@ def test_world_that_is_mirrored_with_its_grid(x64):
     np.testing.assert_allclose(render(scene, perspective(volume), settings).rgb, expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("normals", [jvr.AnalyticGradient(of_opacity=True), jvr.CentralDifferences()])
+def test_pre_integrated_segments_know_every_kind_of_normal(normals):
+    """Traced alone: the types of what shaders hand on are checked then."""
+    scene = lit_scene(normals=normals, shadows=jvr.ShadowRays(2.0))
+    picture = jax.eval_shape(jvr.render, scene, perspective(scene.volume, 3, 2), jvr.Settings(quadrature=jvr.PreIntegrated()))
+    assert picture.rgb.shape == (2, 3, 3)
+
+
 @pytest.mark.slow
 def test_pre_integrated_segments_converge_to_the_same_lit_picture(x64):
     """With normals that are continuous; those of the interpolant jump from cell to cell."""

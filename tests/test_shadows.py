@@ -402,12 +402,13 @@ def test_light_moved_and_occluder_thickened(shadows, x64):
 
     p = {"occluder": jnp.array(0.6), "position": jnp.array([7.0, 6.3, 16.0])}
     gradient = compiled(jax.grad(brightness))(p)
-    moves = [("occluder", 0.01 * np.ones(()))] + [("position", 0.02 * np.eye(3)[a]) for a in range(3)]
+    moves = [("occluder", 0.01 * np.ones(()))] + [("position", 0.01 * np.eye(3)[a]) for a in range(3)]
     ends = [p | {name: p[name] + sign * move} for name, move in moves for sign in (1, -1)]
     values = compiled(lambda ends: jax.lax.map(brightness, ends))(jax.tree.map(lambda *x: jnp.stack(x), *ends)).reshape(-1, 2)
     for (name, move), (above, below) in zip(moves, np.asarray(values), strict=True):
         expected, found = above - below, 2 * np.sum(move * np.asarray(gradient[name]))
-        # Central differences of steps of a hundredth: their own error is about 1e-3.
+        # Central differences of steps of a hundredth: their own error is up to 4e-3 (one of 2e-4 a tenth as long), from the kinks between
+        # the nodes of a shadow volume.
         np.testing.assert_allclose(found, expected, rtol=0.01, err_msg=name)
     assert gradient["occluder"] < 0
 

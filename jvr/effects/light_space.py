@@ -20,7 +20,7 @@ from jvr.march.steps import Point
 from jvr.model.light import AbstractLight, DirectionalLight, perpendicular
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.numerics import direction_and_length, dot, ray_box
+from jvr.numerics import direction_and_length, dot, larger, ray_box, smaller
 from jvr.types import Channels, Scalar, Triple, Vector
 
 # A light nearer to the bounding sphere of the volume than this share of its radius shines in all directions.
@@ -136,7 +136,7 @@ def rays_through(space: AbstractLightSpace, scene: Scene, u: Float[Array, "rays"
         enters, leaves = ray_box(p, along, *volume.domain)
         if clipping is not None:
             near, far = ray_box(x, direction, tuple(clipping.lower), tuple(clipping.upper))
-            enters, leaves = jnp.maximum(enters, near), jnp.minimum(leaves, far)
+            enters, leaves = larger(enters, near), smaller(leaves, far)
         hit = leaves > enters
         return LightRays(p, along, length, jnp.where(hit, enters, 0.0), jnp.where(hit, leaves, 0.0))
 
@@ -148,7 +148,7 @@ def depth_between(
 ) -> Channels:
     """Optical depth of each ray between two depths `w`, by one sample in the middle of what of that is inside of the volume: exact where
     the medium is homogeneous, and continuous where a border moves."""
-    low, high = (jnp.clip(w * rays.length, rays.enters, rays.leaves) for w in (begin, end))
+    low, high = (smaller(larger(w * rays.length, rays.enters), rays.leaves) for w in (begin, end))
     middle, inside = 0.5 * (low + high), high > low
     p = (s + middle * d for s, d in zip(rays.start, rays.direction, strict=True))
     # Where nothing is inside, and by a rounding elsewhere, the middle may be outside, where nothing may be read.

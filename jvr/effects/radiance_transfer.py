@@ -23,7 +23,7 @@ from jvr.model.harmonics.basis import basis, count
 from jvr.model.light import perpendicular
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import ClippingBox, Volume
-from jvr.numerics import direction_and_length, one_minus_exp, ray_box
+from jvr.numerics import direction_and_length, larger, one_minus_exp, ray_box, smaller
 from jvr.types import Channels, Triple
 
 Numbers: TypeAlias = Float[Array, "..."]
@@ -336,8 +336,8 @@ def _rays(volume: Volume, clipping: ClippingBox | None, p: Triple, direction: Tr
     t_in, t_out = ray_box(p, along, *volume.domain)
     if clipping is not None:
         near, far = ray_box(volume.world_from_point(p), direction, tuple(clipping.lower), tuple(clipping.upper))
-        t_in, t_out = jnp.maximum(t_in, near), jnp.minimum(t_out, far)
-    t_in = jnp.maximum(t_in, 0.0)
+        t_in, t_out = larger(t_in, near), smaller(t_out, far)
+    t_in = larger(t_in, 0.0)
     hit = t_out > t_in
     return _Rays(p, direction, along, jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0))
 
@@ -351,7 +351,7 @@ def _carried(transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo:
 
     def one_step(state: tuple[Channels, Channels], ends: tuple[Numbers, Numbers]) -> tuple[Channels, Channels]:
         tau, colour = state
-        begin, end = (jnp.clip(e, rays.t_in, rays.t_out) for e in ends)
+        begin, end = (smaller(larger(rays.t_in, e), rays.t_out) for e in ends)
         middle = 0.5 * (begin + end)
         # By a rounding the middle may be outside, where nothing may be read.
         at = tuple(jnp.clip(c + middle * d, a, b) for c, d, a, b in zip(rays.p, rays.along, lower, upper, strict=True))

@@ -15,7 +15,7 @@ from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
 from jvr.model.volume import ClippingBox
-from jvr.numerics import ray_box
+from jvr.numerics import ray_box, smaller
 from jvr.types import Channels, Scalar
 
 
@@ -82,9 +82,9 @@ class RayVisibility(AbstractVisibility):
         # No light that casts shadows depends on where the eye is.
         towards, distance, _ = jax.vmap(lambda x: light.arrives(x, x))(x)
         along = volume.grid_from_world(towards, direction=True)
-        length = jnp.minimum(ray_box(points.p, along, *volume.domain)[1], distance)
+        length = smaller(ray_box(points.p, along, *volume.domain)[1], distance)
         if clipping is not None:
-            length = jnp.minimum(length, ray_box(x, towards, tuple(clipping.lower), tuple(clipping.upper))[1])
+            length = smaller(length, ray_box(x, towards, tuple(clipping.lower), tuple(clipping.upper))[1])
         reaches = wanted & (length > 0)
         keep = lambda v: tuple(jnp.where(reaches, c, 0.0) for c in v)
         return Rays(keep(points.p), keep(along), jnp.where(reaches, length, 0.0))

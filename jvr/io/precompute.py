@@ -76,7 +76,7 @@ def precompute(
         order = _material_order(scene)
         material = (scene.material, np.asarray(order))
         project = lambda inputs: inputs[0].projected(order)
-        projected = _kept(folder, project, material, lambda: jax.jit(project)(material), "material", report)
+        projected = _kept(folder, project, material, lambda: _projected(scene.material, order), "material", report)
         scene = dataclasses.replace(scene, material=projected)
     if scene.radiance_transfer is None or scene.radiance_transfer.is_frozen:
         return scene
@@ -98,6 +98,9 @@ def precompute(
         folder, whole, inputs, lambda: _project(scene, progress or (lambda share: None)), "radiance transfer", report
     )
     return dataclasses.replace(scene, radiance_transfer=transfer.with_projected(projected))
+
+
+_projected = jax.jit(lambda material, order: material.projected(order), static_argnums=1)
 
 
 def as_precomputed(scene: Scene) -> Scene:

@@ -26,6 +26,7 @@ from jvr.march.compact import for_each, map_selected, write
 from jvr.march.oracle import DistanceField
 from jvr.march.sums import Sums, add, join, opacity, opaque_depth, through, transmittance
 from jvr.model.volume import Volume
+from jvr.numerics import larger, smaller
 from jvr.types import Channels, Scalar, Triple
 
 # The number of a slice that no picture has.
@@ -284,7 +285,7 @@ def position(rows: Float[Array, "lanes 8"], k: Int[Array, ""], dt: Scalar, shape
 
 def distance(rows: Float[Array, "lanes 8"], k: Array, dt: Scalar) -> Float[Array, "lanes"]:
     """`u` on slice `k`."""
-    return jnp.clip(rows[:, 6] + k * dt, 0.0, rows[:, 7])
+    return smaller(larger(rows[:, 6] + k * dt, 0.0), rows[:, 7])
 
 
 def add_block(sums: Sums, gathered: Gathered) -> Sums:

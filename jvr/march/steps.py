@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jvr.numerics import larger
 from jvr.types import Channels, Scalar, Triple
 
 
@@ -61,7 +62,7 @@ def segment(k: Int[Array, "..."], count: Int[Array, "rays"], length: Float[Array
     so that a finished ray never reads outside of the medium.
     """
     start = k * dt
-    last = jnp.maximum(length - start, 0.0)
+    last = larger(length - start, 0.0)
     extent = jnp.where(k < count - 1, dt, jnp.where(k < count, last, 0.0))
     return extent, jnp.where(k < count, start + extent / 2, length)
 

@@ -105,7 +105,11 @@ class AbstractDifferences(AbstractNormals):
 
     def resample(self, volume: Volume, p: Triple) -> Resampled:
         s = volume.sample(p)
-        around = tuple(volume.sample(self.neighbour(volume.shape, p, o)) for o in self.offsets)
+        # Interpolation rounds a constant otherwise at each point. What differs by no more is the same, else rounding decides the normals.
+        noise = 8 * jnp.finfo(s.dtype).eps * (jnp.abs(s) + jnp.abs(volume.intercept))
+        known = jax.lax.stop_gradient
+        steady = lambda x: jnp.where(jnp.abs(x - s) <= noise, known(s) + (x - known(x)), x)
+        around = tuple(steady(volume.sample(self.neighbour(volume.shape, p, o))) for o in self.offsets)
         return (s, (), around) if self.of_opacity else (s, self.difference(volume.shape, p, s, around), ())
 
     def deposit(self, volume: Volume, total: tuple[Volume, Any], p: Triple, cotangent: Resampled) -> tuple[Volume, Any]:
@@ -166,7 +170,8 @@ class SobelDifferences(AbstractDifferences):
             total = jnp.zeros_like(center)
             for offset, value in zip(self.offsets, around, strict=True):
                 smooth = [2 - abs(o) for a, o in enumerate(offset) if a != axis]
-                total += offset[axis] * smooth[0] * smooth[1] / 16 * value
+                # Less the value at the point, so that a constant leaves nothing: weights sum to zero, rounded products need not.
+                total += offset[axis] * smooth[0] * smooth[1] / 16 * (value - center)
             return divide_or_zero(total, _span(shape, p, axis, -1, 1))
 
         return tuple(along(axis) for axis in range(3))

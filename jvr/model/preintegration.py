@@ -20,7 +20,7 @@ the next term of Legendre's expansion of `exp(-tau)`, of order `d^5` also. With 
 
 import itertools
 import math
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.model.optical import AbstractOpticalModel
-from jvr.model.transfer import Classified, LinearTransfer, LutTransfer
+from jvr.model.transfer import AbstractTransfer, Classified, LinearTransfer, LutTransfer
 from jvr.numerics import divide_or_zero, one_minus_exp, read_run
 from jvr.types import Channels, Scalar, Triple
 
@@ -62,7 +62,7 @@ class SegmentMeans(NamedTuple):
         return tuple(e + attenuated(j, s, dt) for e, j, s in zip(emitted, rest, sigma_t, strict=True)), dtau
 
 
-class PreIntegratedTable(eqx.Module):
+class PreIntegratedTable(AbstractTransfer):
     """A table with the means over its blocks of intervals, ready for `segment`. Made once, outside of a march's loop.
 
     **Arguments:** `table`: `LinearTransfer` or `LutTransfer`; `parts`: how many equal parts of a segment its self-attenuation takes
@@ -76,7 +76,6 @@ class PreIntegratedTable(eqx.Module):
     entries: Float[Array, "entries columns"]
     blocks: Float[Array, "blocks means"]
     parts: int = eqx.field(static=True)
-    takes_gradient: ClassVar[bool] = False
 
     def __init__(self, table: LinearTransfer | LutTransfer, parts: int = 1):
         if not isinstance(table, LinearTransfer | LutTransfer):
@@ -92,9 +91,11 @@ class PreIntegratedTable(eqx.Module):
         self.entries = jnp.pad(jnp.concatenate([x[:, None], table.rgb, sigma_t], axis=1), ((1, 1), (0, 0)), mode="edge")
         self.blocks = _blocks(x, table.rgb, sigma_t)
 
-    def evaluate(self, s: Scalar) -> Classified:
-        """Colour and extinction at one scalar."""
+    def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         return self.table.evaluate(s)
+
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
+        return self.table.is_visible(low, high, least)
 
     def segment(self, optical: AbstractOpticalModel, s0: Scalar, s1: Scalar, dt: Scalar) -> tuple[Channels, Channels]:
         """Radiance that leaves a segment of length `dt` along which the scalar goes linearly from `s0` to `s1`, and its optical

@@ -69,22 +69,32 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
 
 def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> Rendering:
     """`render` with every ray and every visible sample."""
-    height, width = camera.height, camera.width
-    compiling, at_hand = is_traced(()), not is_traced((scene, camera))
-    if not compiling and not at_hand and isinstance(settings.adjoint, Replay) and not prepares_light(scene):
-        # Inside of `jax.grad` or `jax.vmap`, and of no program.
+    if is_traced(()):
+        return _inside(scene, camera, settings)
+    if is_traced((scene, camera)):
+        # Inside of `jax.grad`, `jax.jvp` or `jax.vmap`, and of no program: they take a compiled one as a single operation.
+        if not isinstance(settings.adjoint, Replay) or prepares_light(scene):
+            return _one_program(scene, camera, settings)
         made: Any = reversible(settings, scene, camera)
         (rgb, alpha, depth), steps = made
         return Rendering(rgb, alpha, depth, RenderStats(steps))
-    if at_hand:
-        where = compiled_seen(scene, settings)
-        part = functools.partial(_program, scene, camera, settings, where)
-        (rgb, alpha, depth), steps = joined(height, width, in_parts(part, height, width, settings.tile))
-    else:
-        where = seen(scene, settings)
-        rays = _in_tiles(scene, camera, settings, where, all_blocks(height, width))
-        (rgb, alpha, depth), steps = picture_of(rays, height, width)
+    height, width = camera.height, camera.width
+    where = compiled_seen(scene, settings)
+    part = functools.partial(_program, scene, camera, settings, where)
+    (rgb, alpha, depth), steps = joined(height, width, in_parts(part, height, width, settings.tile))
     return Rendering(rgb, alpha, depth, RenderStats(steps, shadows=where.shadow_stats))
+
+
+def _inside(scene: Scene, camera: AbstractCamera, settings: Settings) -> Rendering:
+    """The picture as a part of a program."""
+    height, width = camera.height, camera.width
+    where = seen(scene, settings)
+    rays = _in_tiles(scene, camera, settings, where, all_blocks(height, width))
+    (rgb, alpha, depth), steps = picture_of(rays, height, width)
+    return Rendering(rgb, alpha, depth, RenderStats(steps, shadows=where.shadow_stats))
+
+
+_one_program = jax.jit(_inside, static_argnums=2)
 
 
 def _render_blocks(

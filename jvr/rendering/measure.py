@@ -1,7 +1,6 @@
 """What accuracy costs in time: pictures and gradients under several settings, against a reference."""
 
 import dataclasses
-import functools
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -11,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jvr.march.differentiation import Replay
 from jvr.model.camera import AbstractCamera
@@ -62,39 +62,42 @@ def measure(
         raise ValueError("measure needs at least one jvr.Settings to compare with the reference")
     step = min(s.step for s in settings) / FINER if reference_step is None else reference_step
     truth = _reference(scene, camera, Settings(step, termination=0.0, skipping=False), unknowns)
-    programs = [_program(s, unknowns) for s in settings]
     first, images = [], []
-    for program in programs:
+    for one in settings:
         began = time.perf_counter()
-        images.append(jax.block_until_ready(program(scene, camera)))
+        images.append(jax.block_until_ready(_picture(scene, camera, one, unknowns)))
         first.append(time.perf_counter() - began)
-    times: list[list[float]] = [[] for _ in programs]
+    times: list[list[float]] = [[] for _ in settings]
     for _ in range(repeats):
-        for program, seconds in zip(programs, times, strict=True):
+        for one, seconds in zip(settings, times, strict=True):
             began = time.perf_counter()
-            jax.block_until_ready(program(scene, camera))
+            jax.block_until_ready(_picture(scene, camera, one, unknowns))
             seconds.append(time.perf_counter() - began)
     rows = zip(settings, map(statistics.median, times), first, images, strict=True)
     return tuple(_compare(truth, s, median, once - median, image) for s, median, once, image in rows)
 
 
-@functools.lru_cache(maxsize=32)
-def _program(settings: Settings, unknowns: Callable[[Scene], Any] | None) -> Callable[..., Any]:
-    """Picture, number of samples and gradient (or `None`) as a compiled function of scene and camera."""
-
-    def picture(scene: Scene, camera: AbstractCamera):
-        image = render(scene, camera, settings)
-        return 0.5 * jnp.mean(jnp.square(image.rgb)), (image.rgb, image.stats.samples)
-
+def _picture(
+    scene: Scene, camera: AbstractCamera, settings: Settings, unknowns: Callable[[Scene], Any] | None
+) -> tuple[Array, Array, Any]:
+    """Picture, number of samples and gradient, a scene of `None` but for the unknowns, or `None`."""
     if unknowns is None:
-        return lambda scene, camera: (*picture(scene, camera)[1], None)
+        image = render(scene, camera, settings)
+        return image.rgb, image.stats.samples, None
+    # A tree says which arrays are unknown, and not the function: that may be another one each time, for which all would be compiled anew.
+    is_unknown = eqx.tree_at(
+        unknowns, jax.tree.map(lambda _: False, scene), replace_fn=lambda node: jax.tree.map(lambda _: True, node)
+    )
+    (_, picture), gradient = _with_gradient(*eqx.partition(scene, is_unknown), camera, settings)
+    return *picture, gradient
 
-    def with_gradient(scene: Scene, camera: AbstractCamera):
-        into = lambda values: eqx.tree_at(unknowns, scene, values)
-        (_, result), gradient = jax.value_and_grad(lambda v: picture(into(v), camera), has_aux=True)(unknowns(scene))
-        return *result, gradient
 
-    return eqx.filter_jit(with_gradient)
+def _brightness(unknown: Scene, known: Scene, camera: AbstractCamera, settings: Settings) -> tuple[Array, tuple[Array, Array]]:
+    image = render(eqx.combine(unknown, known), camera, settings)
+    return 0.5 * jnp.mean(jnp.square(image.rgb)), (image.rgb, image.stats.samples)
+
+
+_with_gradient = jax.jit(jax.value_and_grad(_brightness, has_aux=True), static_argnums=3)
 
 
 def _reference(scene: Scene, camera: AbstractCamera, settings: Settings, unknowns: Callable[[Scene], Any] | None) -> Any:
@@ -103,7 +106,7 @@ def _reference(scene: Scene, camera: AbstractCamera, settings: Settings, unknown
     with jax.enable_x64(True):
         scene, camera = jax.tree.map(double, (scene, camera))
         settings = eqx.tree_at(lambda s: s.adjoint, settings, Replay())
-        rgb, _, gradient = _program(settings, unknowns)(scene, camera)
+        rgb, _, gradient = _picture(scene, camera, settings, unknowns)
         return np.asarray(rgb), jax.tree.map(np.asarray, gradient)
 
 

@@ -6,7 +6,6 @@ more than the tolerance; the others keep their prediction. Halving the distance 
 predicted between good predictions is good; a feature that falls between the pixels of the second grid is missed.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -41,7 +40,6 @@ class _Picture(NamedTuple):
     traced: Bool[Array, "pixels"]
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
 # Compiled as one program also where it is called with arrays at hand; inside another program it is a part of that.
 @jax.jit
 def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sampling: Refinement) -> Rendering:

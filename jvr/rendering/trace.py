@@ -14,7 +14,7 @@ from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
-from jvr.numerics import divide_or_zero, one_minus_exp, ray_box
+from jvr.numerics import divide_or_zero, larger, one_minus_exp, ray_box, smaller
 from jvr.rendering.medium import medium, natural, occupancy, visibility
 from jvr.rendering.settings import Settings
 from jvr.types import Scalar, Triple
@@ -127,8 +127,8 @@ def enter(
     t_in, t_out = ray_box(start, along, *scene.volume.domain)
     if scene.clipping is not None:
         near, far = ray_box(origin, direction, tuple(scene.clipping.lower), tuple(scene.clipping.upper))
-        t_in, t_out = jnp.maximum(t_in, near), jnp.minimum(t_out, far)
-    t_in = jnp.maximum(t_in, -behind)
+        t_in, t_out = larger(t_in, near), smaller(t_out, far)
+    t_in = larger(t_in, -behind)
     hit = t_out > t_in
     # A ray that misses gets harmless numbers before any arithmetic, so that its derivative is zero and not 0 * inf.
     t_in, t_out = jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0)

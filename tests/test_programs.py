@@ -1,0 +1,100 @@
+"""Derivatives of what is not compiled itself run as compiled programs, which are kept as long as somebody may want them."""
+
+import dataclasses
+
+import jax
+import jax.monitoring
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import compiled, linear_transfer, perspective, voxels
+
+import jvr
+
+compilations = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, seconds, **_: compilations.append(event) if event == "/jax/core/compile/backend_compile_duration" else None
+)
+
+
+def scene(**parts):
+    return jvr.Scene(jvr.Volume(voxels(), None), linear_transfer(), background=[0.1, 0.2, 0.3], **parts)
+
+
+SUN = jvr.DirectionalLight([-0.4, 1.0, -0.5])
+LIT = {"lights": (SUN,), "shading": jvr.Lambert()}
+FORWARD, ROWS = jvr.Settings(adjoint=jvr.Forward()), jvr.Settings(adjoint=jvr.Rows())
+CASES = {
+    "plain": ({}, jvr.Settings()),
+    "shadow rays": ({**LIT, "shadows": jvr.ShadowRays(2.0)}, jvr.Settings()),
+    "shadow volume": ({**LIT, "shadows": jvr.ShadowVolume(1.0)}, jvr.Settings()),
+    "scattering": ({"lights": (SUN,), "scattering": jvr.SingleScattering()}, jvr.Settings()),
+    "refinement": ({}, jvr.Settings(sampling=jvr.Refinement(tile=2))),
+    "forward": ({}, FORWARD),
+    "forward, clipped": ({"clipping": jvr.ClippingBox([1.0, 1.0, 1.0], [3.0, 4.0, 5.0])}, FORWARD),
+    "rows": ({}, ROWS),
+}
+
+
+def moving(base, camera, what):
+    """What is differentiated, and the scene and the camera for a value of it."""
+    if what == "voxels":
+        return base.volume.values, lambda v: (dataclasses.replace(base, volume=jvr.Volume(v, None)), camera)
+    if what == "camera":
+        return camera.world_from_camera, lambda m: (base, dataclasses.replace(camera, world_from_camera=m))
+    if what == "light":
+        light = lambda d: dataclasses.replace(SUN, direction=d)
+        return SUN.direction, lambda d: (dataclasses.replace(base, lights=(light(d),)), camera)
+    return base.transfer, lambda t: (dataclasses.replace(base, transfer=t), camera)
+
+
+@pytest.mark.parametrize(
+    ("case", "what"),
+    [
+        ("shadow volume", "transfer"),
+        ("forward, clipped", "camera"),
+        *(
+            pytest.param(*c, marks=pytest.mark.slow)
+            for c in (
+                ("plain", "transfer"),
+                ("rows", "transfer"),
+                ("shadow rays", "transfer"),
+                ("shadow rays", "voxels"),
+                ("shadow rays", "camera"),
+                ("shadow volume", "light"),
+                ("scattering", "light"),
+                ("refinement", "transfer"),
+                ("forward", "voxels"),
+            )
+        ),
+    ],
+)
+def test_derivatives_that_are_not_compiled_are_one_program(case, what):
+    """Few programs are compiled for the first call, where every operation would be one by itself, and none for the second; the values are
+    those of a derivative that is compiled as a whole."""
+    parts, settings = CASES[case]
+    base = scene(**parts)
+    value, changed = moving(base, perspective(base.volume), what)
+    along = jax.tree.map(jnp.ones_like, value)
+
+    def loss(value):
+        rgb = jvr.render(*changed(value), settings).rgb
+        return jnp.vdot(rgb, jnp.arange(float(rgb.size)).reshape(rgb.shape) / rgb.size)
+
+    def derivative(value):
+        if isinstance(settings.adjoint, jvr.Forward):
+            return jax.jvp(loss, (value,), (along,))[1]
+        return jax.grad(loss)(value)
+
+    other = jax.tree.map(lambda x: 1.001 * x, value)
+    jax.clear_caches()
+    compilations.clear()
+    found = derivative(value)
+    assert 0 < len(compilations) < 25
+    compilations.clear()
+    again = derivative(other)
+    assert not compilations
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(again))
+    expected = compiled(derivative)(value)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * np.abs(b).max())
