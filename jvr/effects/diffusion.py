@@ -5,7 +5,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jvr.model.dipole import Dipole
 from jvr.model.volume import Volume
@@ -19,35 +19,35 @@ def scatter(
     radius: float,
     volume: Volume,
     coefficients: Float[Array, "x y z channels bands"],
-    opened: Float[Array, "x y z"],
-) -> tuple[Float[Array, "x y z 3 bands"], Float[Array, "x y z"]]:
-    """What every node receives after scattering, in each colour, and `open` spread alike.
+    there: Bool[Array, "x y z"],
+) -> Float[Array, "x y z 3 bands"]:
+    """What every node receives after scattering, in each colour.
 
         L'(x) = R sum_i R_d(|x - x_i|) L(x_i) / sum_i R_d(|x - x_i|)
 
-    over the nodes `x_i` of the medium (`open > 0`) in a neighbourhood, with the dipole's diffuse reflectance `R_d` and its total `R`.
+    over the nodes `x_i` of the medium (`there`) in a neighbourhood, with the dipole's diffuse reflectance `R_d` and its total `R`.
     The paper's equation (4) divides by the number of neighbours instead, which leaves the scale of the picture to the units of `R_d`.
 
     **Arguments:** `radius`: of the neighbourhood, as a share of the volume's longest side, and at most that share of the longest axis in
     voxels along each (they may differ where voxels are longer than wide). By FFT, so that the time hardly depends on it.
     Differentiable in everything.
     """
-    kernel = kernel_of(dipole, radius, volume, opened.shape)
-    there = (opened > 0).astype(opened.dtype)
-    spread = lambda field, k: _convolved(field * there, k)
-    weight = jax.vmap(lambda k: spread(there, k))(kernel)
+    kernel = kernel_of(dipole, radius, volume, there.shape)
+    inside = there.astype(coefficients.dtype)
+    spread = lambda field, k: _convolved(field * inside, k)
+    weight = jax.vmap(lambda k: spread(inside, k))(kernel)
     # A node of the medium has at least itself, unless all of the kernel underflows: then it keeps what it has. Elsewhere, what FFT leaves
     # of zero is rounding.
-    spreads = (there > 0) & (weight > 0)
+    spreads = there & (weight > 0)
     safe = jnp.where(spreads, weight, 1.0)
-    mean = lambda field, c: jnp.where(spreads[c], spread(field, kernel[c]) / safe[c], field * there)
+    mean = lambda field, c: jnp.where(spreads[c], spread(field, kernel[c]) / safe[c], field * inside)
     total, channels = dipole.total, coefficients.shape[3]
 
     def band(values: Float[Array, "x y z channels"]) -> Float[Array, "x y z 3"]:
         return jnp.stack([total[c] * mean(values[..., c % channels], c) for c in range(3)], axis=-1)
 
     scattered = jax.lax.map(band, jnp.moveaxis(coefficients, -1, 0))
-    return jnp.moveaxis(scattered, 0, -1), jnp.mean(jnp.stack([mean(opened, c) for c in range(3)]), axis=0)
+    return jnp.moveaxis(scattered, 0, -1)
 
 
 def kernel_of(dipole: Dipole, radius: float, volume: Volume, shape: tuple[int, ...]) -> Float[Array, "3 x y z"]:

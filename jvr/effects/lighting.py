@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from jvr.effects.cut import CutFaces
+from jvr.effects.own_shadow import Segment
 from jvr.march.shaders import OpticalShader, PreIntegratedShader
 from jvr.march.steps import Point, Sample
 from jvr.model.by_value import at_value
@@ -36,12 +37,12 @@ class LitShader(OpticalShader):
     natural: Any = None  # a `jvr.effects.natural_light.NaturalLight`, where there is light from all around
 
     def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        factor, added = self.light_at(sample, point)
+        factor, added = self.light_at(sample, point, medium, dt)
         rgb = tuple(c * a + b for c, a, b in zip(medium.rgb, factor, added, strict=True))
         return self.optical.segment(Classified(rgb, medium.sigma_t), dt)
 
-    def light_at(self, sample: Sample, point: Point) -> tuple[Triple, Triple]:
-        """`a` and `b` of a sample."""
+    def light_at(self, sample: Sample, point: Point, medium: Classified, dt: Scalar) -> tuple[Triple, Triple]:
+        """`a` and `b` of a sample that stands for a segment of length `dt` of a medium."""
         zero = jnp.zeros_like(sample.s)
         x = transformed(self.world_from_grid, point.p)
         w_o, _ = direction_and_length(turned(-self.world_from_grid[:3, :3], point.direction))
@@ -76,7 +77,8 @@ class LitShader(OpticalShader):
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
         if self.natural is not None:
             around = arrives[len(self.lights)] if len(arrives) > len(self.lights) else ()
-            tinted, plain = self.natural.reflect(sample.s, magnitude, normal, w_o, around, cut)
+            here = Segment(medium, sample.gradient, dt)
+            tinted, plain = self.natural.reflect(sample.s, magnitude, normal, w_o, around, cut, here)
             factor = [f + reflects * c for f, c in zip(factor, tinted, strict=True)]
             added = [b + reflects * c for b, c in zip(added, plain, strict=True)]
         return tuple(factor), tuple(added)
@@ -88,7 +90,8 @@ class LitPreIntegratedShader(LitShader, PreIntegratedShader):
     def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
         emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
-        factor, added = self.light_at(self.prepare(transfer.table, _mean(front, back), point), point)
+        middle = self.prepare(transfer.table, _mean(front, back), point)
+        factor, added = self.light_at(middle, point, transfer.evaluate(middle.s), dt)
         # A constant colour of the given optical depth.
         extra, _ = self.optical.segment(Classified(added, dtau), jnp.ones_like(dt))
         return tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False)), dtau

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jvr.effects.own_shadow import OwnShadow, Segment, own_shadow_of
 from jvr.effects.shading import share_of
 from jvr.model.harmonics.basis import band_of, basis, count
 from jvr.model.material import About, HarmonicMaterial, Lobe
@@ -80,6 +81,7 @@ class NaturalLight(eqx.Module):
     positions: Float[Array, "classes"]
     threshold: Scalar
     clamped: bool = eqx.field(static=True)
+    shadow: OwnShadow | None = None
 
     @property
     def needs_gradient(self) -> bool:
@@ -87,15 +89,24 @@ class NaturalLight(eqx.Module):
         return any(table is not None and table.about != "eye" for table in (self.tinted, self.plain))
 
     def reflect(
-        self, s: Scalar, magnitude: Scalar, normal: Triple, w_o: Triple, arriving: Channels, cut: Scalar | float = 0.0
+        self,
+        s: Scalar,
+        magnitude: Scalar,
+        normal: Triple,
+        w_o: Triple,
+        arriving: Channels,
+        cut: Scalar | float = 0.0,
+        here: Segment | None = None,
     ) -> tuple[Triple, Triple]:
         """What the colour of the medium is multiplied with, and what is added to that in the light's own colour.
 
+        `arriving`: of the environment, and where surfaces shadow themselves, how much of one there is; `here`: the segment, then.
         `magnitude`: length of the gradient. Where it is weak, bands of the light above the first count less, but for the share of a point
         that is a `cut`. The normal is turned to the eye.
         """
         zero, surface = jnp.zeros_like(s), share_of(magnitude, self.threshold)
         surface = surface + cut * (1 - surface)
+        arriving, solid = (arriving, zero) if self.shadow is None else (arriving[:-1], arriving[-1])
         coefficients, share = self._light(arriving, s)
         turn = jnp.where(dot(normal, w_o) < 0, -1.0, 1.0)
         normal = tuple(turn * c for c in normal)
@@ -105,13 +116,18 @@ class NaturalLight(eqx.Module):
         there = (surface > 0) & (jnp.abs(cosine) + sine > 0)
         theta = jnp.where(there, jnp.arctan2(sine, jnp.where(there, cosine, 1.0)), 0.0)
         place = self._class(s)
+        kept = [(1.0,)] * 3
+        if self.shadow is not None:
+            assert here is not None
+            kept = self.shadow.remaining(s, magnitude, normal, w_o, here, solid)
         parts = []
         for table in (self.tinted, self.plain):
             if table is None:
                 parts.append((zero,) * 3)
                 continue
             counts = zero + 1 if table.about == "eye" else surface
-            radiance = _integrate(table.at(place, theta), coefficients, table.directions(normal, across, w_o), counts)
+            scales = [kept[0], *(tuple(counts * k for k in band) for band in kept[1:])]
+            radiance = _integrate(table.at(place, theta), coefficients, table.directions(normal, across, w_o), scales)
             radiance = tuple(c * r for c, r in zip(share, radiance, strict=True))
             parts.append(tuple(jnp.maximum(r, 0.0) for r in radiance) if self.clamped else radiance)
         return parts[0], parts[1]
@@ -133,31 +149,37 @@ class NaturalLight(eqx.Module):
 
 
 def natural_light(
-    material: HarmonicMaterial, light: Float[Array, "bands 3"], *, clamped: bool, order: int, from_samples: bool
+    material: HarmonicMaterial,
+    light: Float[Array, "bands 3"],
+    *,
+    clamped: bool,
+    order: int,
+    from_samples: bool,
+    shadow: OwnShadow | None = None,
 ) -> NaturalLight:
     """`NaturalLight` up to an order; `from_samples`: each sample brings the coefficients of its light."""
     tinted, plain = (None if lobe is None else PlaneTable.of(lobe, order) for lobe in (material.tinted, material.plain))
     return NaturalLight(
-        None if from_samples else light[: count(order)], tinted, plain, material.positions, material.threshold, clamped
+        None if from_samples else light[: count(order)], tinted, plain, material.positions, material.threshold, clamped, shadow
     )
 
 
 def _integrate(
-    weights: Float[Array, "bands directions channels"], light: list[Triple], directions: list[Triple], surface: Scalar
+    weights: Float[Array, "bands directions channels"], light: list[Triple], directions: list[Triple], scales: Any
 ) -> Triple:
-    """`sum_l sum_k W_lk L_l(d_k)` in each colour."""
+    """`sum_l sum_k W_lk L_l(d_k)` in each colour; `scales[l][channel]`: what counts of a band, of those above the last as of that."""
     bands, _, channels = weights.shape
     order = min(bands, math.isqrt(len(light))) - 1
     band = band_of(order)
-    total = [jnp.zeros_like(surface)] * 3
+    total: list[Any] = [0.0] * 3
     for k, d in enumerate(directions):
         functions = basis(order, d)
         for n in range(order + 1):
             own = np.flatnonzero(band == n)
-            scale = 1.0 if n == 0 else surface
+            scale = scales[min(n, len(scales) - 1)]
             for c in range(3):
                 value = sum(functions[i] * light[i][c] for i in own)
-                total[c] = total[c] + scale * weights[n, k, c % channels] * value
+                total[c] = total[c] + scale[c % len(scale)] * weights[n, k, c % channels] * value
     return tuple(total)
 
 
@@ -182,4 +204,7 @@ def natural_light_of(scene: Scene) -> NaturalLight:
     material: HarmonicMaterial = scene.material.projected(scene.material_order)
     exact = scene.radiance_transfer is not None and scene.radiance_transfer.exact
     order = material.order if exact else min(material.order, environment.order)
-    return natural_light(material, environment.coefficients, clamped=environment.clamped, order=order, from_samples=exact)
+    shadow = own_shadow_of(scene)
+    return natural_light(
+        material, environment.coefficients, clamped=environment.clamped, order=order, from_samples=exact, shadow=shadow
+    )

@@ -3,6 +3,7 @@ sections 4 and 4.1), projected on spherical harmonics at the nodes of a coarse g
 """
 
 import dataclasses
+import itertools
 import math
 from typing import Any, NamedTuple, TypeAlias
 
@@ -24,7 +25,7 @@ from jvr.model.light import perpendicular
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import ClippingBox, Volume
 from jvr.numerics import direction_and_length, larger, one_minus_exp, ray_box, smaller
-from jvr.types import Channels, Triple
+from jvr.types import Channels, Scalar, Triple
 
 Numbers: TypeAlias = Float[Array, "..."]
 
@@ -32,6 +33,10 @@ Numbers: TypeAlias = Float[Array, "..."]
 CHUNK = 256
 # A change of transparency that is a smaller share of `RadianceTransfer.surface` is none: it moves the cone's rim by less than 1e-6.
 FLAT = 1e-3
+# Of such changes, those of a larger share than this have a direction.
+DIRECTED = 0.1
+# How far above a node of a surface rays begin, in distances between nodes: from below a cell of the grid, up its diagonal, into the open.
+LIFT = 1.75
 # Azimuth between one direction and the next, the golden angle.
 GOLDEN = math.pi * (3 - math.sqrt(5))
 
@@ -50,14 +55,16 @@ class ProjectedTransfer(eqx.Module):
 
     - `luminance`: `(x, y, z, 1, bands)` for a transfer without colour, else `(x, y, z, 3, bands)`, or the luma alone where
     - `chroma`: `(x, y, z, 2, fewer bands)` holds orange-blue and green-purple differences (YCoCg); else `None`.
-    - `open`: `(x, y, z)`, the share of the sphere that rays were sent into, `(1 + sin alpha) / 2`.
-    - `made_for`: the numbers of the transfer function, and of the material where that is part of it.
+    - `solid`: `(x, y, z)`, how much of an opaque surface there is, from above 0 to 1; 0 where nothing is near and nothing was projected.
+    - `facing`: `(x, y, z, 3)`, the unit vector away from the medium, shorter where that has hardly a direction.
+    - `made_for`: the numbers of the transfer function, of the material where that is part of it, and whether that has a normal.
     - `scattered`: whether the scattering pass has been made.
     """
 
     luminance: Float[Array, "x y z channels bands"]
     chroma: Float[Array, "x y z 2 fewer"] | None
-    open: Float[Array, "x y z"]
+    solid: Float[Array, "x y z"]
+    facing: Float[Array, "x y z 3"]
     made_for: Float[Array, "numbers"]
     scattered: bool = eqx.field(static=True, default=False)
 
@@ -74,19 +81,18 @@ class ProjectedTransfer(eqx.Module):
     @property
     def nbytes(self) -> int:
         """Memory of the coefficients."""
-        return sum(x.size * x.dtype.itemsize for x in (self.luminance, self.chroma, self.open) if x is not None)
+        return sum(x.size * x.dtype.itemsize for x in (self.luminance, self.chroma, self.solid, self.facing) if x is not None)
 
 
 class RadianceTransfer(AbstractRadianceTransfer):
     """Shadows, colour bleeding and scattering of light that comes from all around (`Scene(environment=...)`).
 
-    At each node rays are sent into the part of the sphere that is not below a surface: with the transparency `tau` of a node's width of
-    medium and the change `m` of it from one node to the next, the below-surface angle is
-
-        alpha = pi / 2 (1 - (1 - tau) m^2 / (m^2 + surface^2)),
-
-    and directions within `pi / 2 + alpha` of the gradient of `tau` are drawn with density `1 / (2 pi (1 + sin alpha))`, `rays` of them
-    on a spiral of equal areas. What they carry is projected on harmonics.
+    Opacities `o` of a node's width of medium, at a node and one node further in all directions, give a surface where the material has a
+    normal: with their change `m` by Sobel's weights it is one by the share `max(o) m^2 / (m^2 + surface^2)`, `solid`. Then rays begin
+    above it, `1.75 solid` nodes along the normal, so that nodes below and above a surface know the same light; what the medium up to
+    there takes is found at each sample (`jvr.effects.own_shadow`). They are sent into the part of the sphere that is not below it: with
+    `alpha = pi / 2 (1 - solid)`, directions within `pi / 2 + alpha` of the normal are drawn with density `1 / (2 pi (1 + sin alpha))`,
+    `rays` of them on a spiral of equal areas, and what they carry is projected on harmonics. The others count as their mean.
 
     **Arguments:**
 
@@ -97,9 +103,9 @@ class RadianceTransfer(AbstractRadianceTransfer):
       white light behind it).
     - `scattering`: `jvr.Dipole(...)` or `None`: each node gets the mean of what its neighbours receive, weighted with the dipole's diffuse
       reflectance; `neighbourhood`: its radius, as a share of the volume's longest side.
-    - `exact`: the triple product of material, light and transfer, instead of the paper's two double products (with the mean of the
-      transfer over the part of the sphere that rays are sent into, so that they are exact where it is the same all over that part and the
-      light is the same from everywhere).
+    - `exact`: the triple product of material, light and transfer at each sample. Without it, nodes know which share of the light arrives
+      of all that a matte surface reflects that faces where the medium there does (with a material without normal: of all light), and the
+      sample multiplies that with its own product of material and light. Both are the same where nothing else is in the way.
     - `chromaticity`: `None`, or the order to keep colour differences at, where rays carry colour; luminance keeps `order`.
     - `step`, `growth`: first step in voxels, and the ratio of a step to the one before; `termination`: a ray ends once its transmittance
       is at most this.
@@ -175,7 +181,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
         now, then = self.made_for(transfer, material), self.projected.made_for
         if now.shape == then.shape and np.allclose(np.asarray(now), np.asarray(then), rtol=1e-6, atol=0):
             return ()
-        what = "transfer function or material" if self.needs_gradient else "transfer function"
+        what = "transfer function or material"
         return (
             f"the radiance transfer was computed for another {what}: call jvr.precompute with a scene that has not been through it",
         )
@@ -211,6 +217,13 @@ class RadianceTransfer(AbstractRadianceTransfer):
         x, y, z = (1 if n == 1 else max(2, math.ceil((n - 1) * self.resolution) + 1) for n in volume.shape)
         return x, y, z
 
+    def node_width(self, volume: Volume) -> Scalar:
+        """The least distance of two nodes, in the world."""
+        return jnp.min(volume.spacing) / self.resolution
+
+    def lift(self, volume: Volume) -> Scalar:
+        return LIFT * self.node_width(volume)
+
     def check_memory(self, volume: Volume, transfer: AbstractTransfer) -> None:
         """**Raises** `ValueError` where the coefficients of all nodes would exceed `memory`."""
         extinctions = len(jax.eval_shape(transfer.evaluate, volume.intercept, volume.intercept).sigma_t)
@@ -226,7 +239,8 @@ class RadianceTransfer(AbstractRadianceTransfer):
     def made_for(self, transfer: AbstractTransfer, material: AbstractMaterial | None) -> Float[Array, "numbers"]:
         """What a projection depends on apart from the volume, as numbers."""
         parts = (transfer, material) if isinstance(self.bleeding, MaterialBleeding) else (transfer,)
-        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(parts)])
+        normal = [] if material is None else [jnp.full(1, float(material.needs_gradient))]
+        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(parts)] + normal)
 
     def boundaries(self, shape: tuple[int, int, int]) -> np.ndarray:
         """Ends of the steps of a ray, as shares of the volume's diameter."""
@@ -263,52 +277,82 @@ def project_nodes(
     clipping: ClippingBox | None,
     medium: Medium,
     albedo: NaturalLight | None,
+    surfaces: bool,
     p: Float[Array, "nodes 3"],
-) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes"]]:
-    """Coefficients of the radiance transfer at grid positions, and `open` of `ProjectedTransfer`.
+) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
+    """Coefficients of the radiance transfer at grid positions, and beside each other `solid` and `facing` of `ProjectedTransfer`.
 
-    **Arguments:** `medium`: what rays pass; `albedo`: where they pick up the material's colour, that under light of one from everywhere.
+    **Arguments:** `medium`: what rays pass; `albedo`: where they pick up the material's colour, that under light of one from everywhere;
+    `surfaces`: whether the material has a normal, so that light from below it does not count.
     """
     nodes = tuple(p.T.astype(volume.slope.dtype))
-    cone = _cone(transfer, volume, medium, nodes)
+    around = _surroundings(transfer, volume, medium, nodes)
+    strength = around.solid * around.strength if surfaces else jnp.zeros_like(around.strength)
+    cone = Cone(around.axis, jnp.sin(0.5 * math.pi * (1 - strength)))
     directions = _spread(cone, transfer.rays)
     wide = lambda c: jnp.broadcast_to(c[:, None], (c.shape[0], transfer.rays)).ravel()
     along = tuple(d.ravel() for d in directions)
-    rays = _rays(volume, clipping, tuple(map(wide, nodes)), along)
+    lift = volume.grid_from_world(tuple(strength * transfer.lift(volume) * c for c in around.axis), direction=True)
+    origins = tuple(c + d for c, d in zip(nodes, lift, strict=True))
+    rays = _rays(volume, clipping, tuple(map(wide, origins)), along)
     carried = _carried(transfer, volume, medium, albedo, rays)
     functions = jnp.stack(basis(transfer.order, directions), axis=-1)
-    # Each sample counts by the inverse of its density, 2 pi (1 + sin alpha).
+    # Each sample counts by the inverse of its density, 2 pi (1 + sin alpha). Directions without rays count as the mean of those with: no
+    # light of theirs is reflected, and a step at the horizon would ring. What is the same from everywhere has no error of the quadrature.
     weight = 2 * math.pi * (1 + cone.sine) / transfer.rays
     values = jnp.stack([c.reshape(p.shape[0], transfer.rays) for c in carried], axis=1)
-    return jnp.einsum("ncr,nrb->ncb", values, functions) * weight[:, None, None], 0.5 * (1 + cone.sine)
+    mean = jnp.mean(values, axis=-1)
+    rest = jnp.einsum("ncr,nrb->ncb", values - mean[..., None], functions) * weight[:, None, None]
+    coefficients = rest.at[..., 0].add(math.sqrt(4 * math.pi) * mean)
+    # Not zero, which says that nothing was projected.
+    solid = jnp.maximum(strength, jnp.finfo(strength.dtype).tiny)
+    return coefficients, jnp.stack([solid, *(around.directed * c for c in around.axis)], axis=-1)
 
 
-def _cone(transfer: RadianceTransfer, volume: Volume, medium: Medium, p: Triple) -> Cone:
-    """Where the rays of nodes go, from the transparency of a node's width of medium and its central differences."""
-    width = jnp.min(volume.spacing) / transfer.resolution
+class Surroundings(NamedTuple):
+    """Transparency of a node's width of medium at a node; how much of a surface there is, from 0 to 1, and the unit vector away from the
+    medium."""
+
+    solid: Numbers
+    strength: Numbers
+    directed: Numbers
+    axis: Triple
+
+
+def _surroundings(transfer: RadianceTransfer, volume: Volume, medium: Medium, p: Triple) -> Surroundings:
+    """From the opacity of a node's width of medium at the node and one node further in all 26 directions, by Sobel's weights: both the
+    nodes below a surface and those above it know where it faces."""
+    width = transfer.node_width(volume)
     lower, upper = volume.domain
-    half = 0.5 / transfer.resolution
-
-    def opacity(p: Triple) -> Numbers:
-        p = tuple(jnp.clip(c, low, high) for c, low, high in zip(p, lower, upper, strict=True))
-        sigma_t = classify_at(medium, _points(p, p), jnp.ones(p[0].shape, bool))[0].sigma_t
-        # Not 1 less the transparency: thin media keep their digits.
-        return one_minus_exp(width * sum(sigma_t[1:], sigma_t[0]) / len(sigma_t))
-
+    sides = [(-1, 0, 1) if n > 1 else (0,) for n in volume.shape]
+    offsets = np.array(list(itertools.product(*sides)), np.float32)
+    weights = np.prod(np.where(offsets == 0, 2.0, 1.0), axis=1)
+    step = 1 / transfer.resolution
+    at = [jnp.clip(c[:, None] + step * o, low, high) for c, o, low, high in zip(p, offsets.T, lower, upper, strict=True)]
+    flat = tuple(c.ravel() for c in at)
+    sigma_t = classify_at(medium, _points(flat, flat), jnp.ones(flat[0].shape, bool))[0].sigma_t
+    tau = (width * sum(sigma_t[1:], sigma_t[0]) / len(sigma_t)).reshape(p[0].shape[0], -1)
+    # Not 1 less the transparency: thin media keep their digits.
+    opacity = one_minus_exp(tau)
     differences = []
     for axis, n in enumerate(volume.shape):
-        ends = [tuple(c + sign * half * (a == axis) for a, c in enumerate(p)) for sign in (-1, 1)]
-        span = jnp.clip(ends[1][axis], 0, n - 1) - jnp.clip(ends[0][axis], 0, n - 1)
-        change = opacity(ends[0]) - opacity(ends[1])
-        differences.append(jnp.where(span > 0, change / jnp.where(span > 0, span, 1.0), 0.0))
+        ahead, behind = (weights * (offsets[:, axis] == side) for side in (1, -1))
+        if n == 1:
+            differences.append(jnp.zeros_like(p[0]))
+            continue
+        span = jnp.clip(p[axis] + step, 0, n - 1) - jnp.clip(p[axis] - step, 0, n - 1)
+        change = opacity @ jnp.asarray((behind - ahead) / ahead.sum(), opacity.dtype)
+        differences.append(change / span)
     inverse = volume.axes_inverse
     gradient = tuple(sum((inverse[j, i] * differences[j] for j in range(3)), jnp.zeros_like(p[0])) for i in range(3))
     axis, length = direction_and_length(gradient)
     # Without a surface the axis only turns the spiral; inside of an opaque medium a gradient would be made of roundings.
-    flat = length * width <= FLAT * transfer.surface
-    axis = tuple(jnp.where(flat, fixed, c) for fixed, c in zip((0.0, 0.0, 1.0), axis, strict=True))
-    strength = opacity(p) * share_of(length * width, jnp.asarray(transfer.surface, length.dtype))
-    return Cone(axis, jnp.sin(0.5 * math.pi * (1 - strength)))
+    flat_there = length * width <= FLAT * transfer.surface
+    axis = tuple(jnp.where(flat_there, fixed, c) for fixed, c in zip((0.0, 0.0, 1.0), axis, strict=True))
+    strength = share_of(2 * length * width, jnp.asarray(transfer.surface, length.dtype))
+    directed = share_of(2 * length * width, jnp.asarray(DIRECTED * transfer.surface, length.dtype))
+    strength, directed = (jnp.where(flat_there, 0.0, x) for x in (strength, directed))
+    return Surroundings(jnp.max(opacity, axis=1), strength, directed, axis)
 
 
 def _spread(cone: Cone, rays: int) -> Triple:

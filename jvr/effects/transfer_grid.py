@@ -1,5 +1,6 @@
 """Radiance transfer at every sample: projected at nodes, multiplied with the light there, interpolated."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -22,10 +23,14 @@ from jvr.effects.radiance_transfer import (
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.harmonics.algebra import product_matrix
-from jvr.model.harmonics.basis import count
+from jvr.model.harmonics.basis import band_of, basis, count
 from jvr.model.scene import Scene
 from jvr.model.volume import ClippingBox, Volume
+from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import Channels
+
+# Weight of the light from all around beside that which a surface faces.
+DARK = 0.005
 
 
 class TransferVisibility(AbstractVisibility):
@@ -66,7 +71,9 @@ def transfer_visibility(scene: Scene, medium: Medium, inner: AbstractVisibility 
     if transfer.exact:
         arriving = _products(coefficients, light, material.projected(scene.material_order).order)
     else:
-        arriving = _shares(projected, coefficients, light)
+        arriving = _shares(projected.facing, coefficients, light)
+    if material.needs_gradient:
+        arriving = jnp.concatenate([arriving, projected.solid[..., None]], axis=-1)
     shape = coefficients.shape[:3]
     x, y, z = ((m - 1) / (n - 1) if n > 1 else 0.0 for n, m in zip(scene.volume.shape, shape, strict=True))
     return TransferVisibility(Grid.of(arriving), (x, y, z), inner, lights)
@@ -87,13 +94,14 @@ def projected_of(scene: Scene) -> ProjectedTransfer:
 
 class TransferProjection(eqx.Module):
     """All that the nodes of a scene are projected with. `albedo`: what a material reflects of light of one from everywhere, where rays
-    pick that up."""
+    pick that up; `surfaces`: whether the material has a normal."""
 
     transfer: RadianceTransfer
     volume: Volume
     clipping: ClippingBox | None
     medium: Medium
     albedo: NaturalLight | None
+    surfaces: bool = eqx.field(static=True)
 
     @classmethod
     def of(cls, scene: Scene, medium: Medium) -> "TransferProjection":
@@ -104,21 +112,22 @@ class TransferProjection(eqx.Module):
             assert scene.material is not None
             everywhere = jnp.full((1, 3), math.sqrt(4 * math.pi), scene.volume.slope.dtype)
             albedo = natural_light(scene.material.projected(0), everywhere, clamped=True, order=0, from_samples=False)
-        return cls(transfer, scene.volume, scene.clipping, medium, albedo)
+        assert scene.material is not None
+        return cls(transfer, scene.volume, scene.clipping, medium, albedo, scene.material.needs_gradient)
 
     def positions(self) -> np.ndarray:
         return node_positions(self.volume, self.transfer.shape(self.volume))
 
-    def nodes(self, index: Int[Array, "nodes"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes"]]:
+    def nodes(self, index: Int[Array, "nodes"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
         """The transfer of some nodes, a chunk at a time."""
         fill = -index.shape[0] % CHUNK
         chunks = jnp.pad(jnp.asarray(self.positions())[index], ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3)
         found = jax.lax.map(lambda p: self.project(p), chunks)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: index.shape[0]], found)
 
-    def project(self, p: Float[Array, "nodes 3"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes"]]:
+    def project(self, p: Float[Array, "nodes 3"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
         """The transfer at grid positions."""
-        return project_nodes(self.transfer, self.volume, self.clipping, self.medium, self.albedo, p)
+        return project_nodes(self.transfer, self.volume, self.clipping, self.medium, self.albedo, self.surfaces, p)
 
     def active(self) -> Bool[Array, "nodes"]:
         """Nodes with something visible no further away than the next node."""
@@ -131,7 +140,7 @@ class TransferProjection(eqx.Module):
         return occupancy.reach[b[0], b[1], b[2]] <= math.ceil(near / occupancy.size)
 
 
-def project_all(projection: TransferProjection) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes"]]:
+def project_all(projection: TransferProjection) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
     """The transfer of all nodes of a scene, zero where nothing is to be seen; chunks without an active node are left out. Traceable."""
     p, active = projection.positions(), projection.active()
     fill = -len(p) % CHUNK
@@ -151,14 +160,14 @@ def project_all(projection: TransferProjection) -> tuple[Float[Array, "nodes cha
 
 
 def finished(
-    scene: Scene, coefficients: Float[Array, "nodes channels bands"], opened: Float[Array, "nodes"]
+    scene: Scene, coefficients: Float[Array, "nodes channels bands"], around: Float[Array, "nodes 4"]
 ) -> ProjectedTransfer:
     """What was projected, scattered and with its colour differences apart where the scene asks for that."""
     transfer = transfer_of(scene)
     shape = transfer.shape(scene.volume)
     made_for = transfer.made_for(scene.transfer, scene.material)
-    grid = coefficients.reshape(*shape, *coefficients.shape[1:])
-    projected = ProjectedTransfer(grid, None, opened.reshape(shape), made_for)
+    grid, around = coefficients.reshape(*shape, *coefficients.shape[1:]), around.reshape(*shape, 4)
+    projected = ProjectedTransfer(grid, None, around[..., 0], around[..., 1:], made_for)
     projected = projected if transfer.scattering is None else scattered(scene, projected)
     return projected if transfer.chromaticity is None else _separated(projected, transfer.chromaticity)
 
@@ -168,10 +177,9 @@ def scattered(scene: Scene, projected: ProjectedTransfer) -> ProjectedTransfer:
     from jvr.effects.diffusion import scatter
 
     transfer = transfer_of(scene)
-    coefficients, opened = scatter(
-        transfer.scattering, transfer.neighbourhood, scene.volume, projected.coefficients, projected.open
-    )
-    return ProjectedTransfer(coefficients, None, opened, projected.made_for, scattered=True)
+    there = projected.solid > 0
+    coefficients = scatter(transfer.scattering, transfer.neighbourhood, scene.volume, projected.coefficients, there)
+    return dataclasses.replace(projected, luminance=coefficients, chroma=None, scattered=True)
 
 
 def _separated(projected: ProjectedTransfer, order: int) -> ProjectedTransfer:
@@ -179,22 +187,26 @@ def _separated(projected: ProjectedTransfer, order: int) -> ProjectedTransfer:
     red, green, blue = jnp.moveaxis(projected.coefficients, 3, 0)
     luma = 0.25 * (red + blue) + 0.5 * green
     chroma = jnp.stack([0.5 * (red - blue), green - luma], axis=3)[..., : count(order)]
-    return ProjectedTransfer(luma[..., None, :], chroma, projected.open, projected.made_for, projected.scattered)
+    return dataclasses.replace(projected, luminance=luma[..., None, :], chroma=chroma)
 
 
 def _shares(
-    projected: ProjectedTransfer, coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "others 3"]
+    facing: Float[Array, "x y z 3"], coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "others 3"]
 ) -> Float[Array, "x y z 3"]:
-    """The share of each colour of the light that arrives: the mean of the transfer over the directions that rays were sent into,
-    weighted with the light; 0 where there is no light. Ringing below zero is cut off."""
-    bands = min(coefficients.shape[-1], light.shape[0])
-    arriving = jnp.einsum("xyzcb,bh->xyzch", coefficients[..., :bands], light[:bands])
-    own = arriving[..., 0, :] if coefficients.shape[3] == 1 else jnp.diagonal(arriving, axis1=3, axis2=4)
-    all_light = math.sqrt(4 * math.pi) * light[0]
-    there = all_light != 0
-    opened = projected.open[..., None]
-    share = own / jnp.where(there, all_light, 1.0) / jnp.where(opened > 0, opened, 1.0)
-    return jnp.maximum(jnp.where(there & (opened > 0), share, 0.0), 0.0)
+    """The share of each colour of the light that arrives, of all that a matte surface would reflect that faces where the node does; 0
+    where there is no light."""
+    arriving = _products(coefficients, light, 2).reshape(*facing.shape[:3], 9, 3)
+    normal, strength = direction_and_length(tuple(jnp.moveaxis(facing, -1, 0)))
+    # A cosine over pi: band l of its coefficients is A_l / pi Y_lm(n). Without a surface all directions count alike.
+    band = band_of(2)
+    functions = jnp.stack(basis(2, normal), axis=-1) * np.array([1, 2 / 3, 1 / 4])[band]
+    functions = jnp.where(band > 0, strength[..., None] * functions, functions)
+    full = jnp.pad(light, ((0, max(9 - light.shape[0], 0)), (0, 0)))[:9]
+    own, whole = jnp.einsum("xyzb,xyzbh->xyzh", functions, arriving), functions @ full
+    # Where a surface faces no light the share is that of all light.
+    parts = ((own, arriving[..., 0, :]), (whole, full[0]))
+    own, whole = (jnp.maximum(faced, 0.0) + DARK * jnp.maximum(all_round, 0.0) for faced, all_round in parts)
+    return divide_or_zero(own, jnp.broadcast_to(whole, own.shape))
 
 
 def _products(

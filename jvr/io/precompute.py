@@ -23,7 +23,7 @@ from jvr.rendering.medium import absorbing, occupancy
 from jvr.rendering.settings import Settings
 
 # Changes whenever what is computed from the same inputs does: what was kept before is then of no use.
-VERSION = 2
+VERSION = 3
 # Order that materials are kept at under an environment of a lower one.
 LEAST_ORDER = 3
 # Nodes in a program of their own, between two reports of progress.
@@ -83,15 +83,15 @@ def precompute(
     transfer = transfer_of(scene)
     if keep_unscattered and transfer.scattering is not None:
         scene = eqx.tree_at(lambda s: s.radiance_transfer.scattering, scene, None)
-    # The light plays no part, and the material where rays do not pick up its colour.
-    plays = isinstance(transfer.bleeding, MaterialBleeding)
+    # The light plays no part, and the material where rays do not pick up its colour none but that it has a normal.
+    plays, normal = isinstance(transfer.bleeding, MaterialBleeding), scene.material is not None and scene.material.needs_gradient
     inputs = (
         scene.volume,
         scene.transfer,
         scene.clipping,
         scene.normals,
         scene.radiance_transfer,
-        scene.material if plays else None,
+        scene.material if plays else np.asarray(normal),
     )
     whole = lambda _: finished(scene, *project_all(_projection(scene)))
     projected = _kept(
@@ -145,16 +145,16 @@ def _project(scene: Scene, progress: Progress) -> ProjectedTransfer:
 
     def one(piece: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         full = np.concatenate([piece, np.full(size - len(piece), piece[-1])])
-        coefficients, opened = _some(projection, jnp.asarray(full, jnp.int32))
+        coefficients, around = _some(projection, jnp.asarray(full, jnp.int32))
         done.append(len(piece))
         progress(sum(done) / len(active))
-        return np.asarray(coefficients)[: len(piece)], np.asarray(opened)[: len(piece)]
+        return np.asarray(coefficients)[: len(piece)], np.asarray(around)[: len(piece)]
 
     shape = jax.eval_shape(project_all, projection)
-    coefficients, opened = (np.zeros(x.shape, x.dtype) for x in shape)
-    for piece, (found, open_) in zip(pieces, in_threads(one, pieces), strict=True):
-        coefficients[piece], opened[piece] = found, open_
-    return jax.jit(finished)(scene, jnp.asarray(coefficients), jnp.asarray(opened))
+    coefficients, around = (np.zeros(x.shape, x.dtype) for x in shape)
+    for piece, (found, near) in zip(pieces, in_threads(one, pieces), strict=True):
+        coefficients[piece], around[piece] = found, near
+    return jax.jit(finished)(scene, jnp.asarray(coefficients), jnp.asarray(around))
 
 
 _some = jax.jit(lambda projection, index: projection.nodes(index))

@@ -79,6 +79,8 @@ class AbstractRadianceTransfer(eqx.Module):
 
     # Whether samples bring the light that reaches them, and not a share of all of it.
     exact: eqx.AbstractVar[bool]
+    # What rays pick up on their way, or `None`.
+    bleeding: eqx.AbstractVar[Any]
     # Highest order of its harmonics.
     order: eqx.AbstractVar[int]
 
@@ -96,6 +98,10 @@ class AbstractRadianceTransfer(eqx.Module):
     @abc.abstractmethod
     def is_final(self) -> bool:
         """Whether a picture has nothing left to do but to multiply it with the light."""
+
+    @abc.abstractmethod
+    def lift(self, volume: Any) -> Scalar:
+        """How far above a surface, in the world, it is known what arrives."""
 
     @abc.abstractmethod
     def outdated(self, transfer: Any, material: AbstractMaterial | None) -> tuple[str, ...]:

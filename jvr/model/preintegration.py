@@ -94,8 +94,8 @@ class PreIntegratedTable(AbstractTransfer):
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         return self.table.evaluate(s)
 
-    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0) -> Bool[Array, ""]:
-        return self.table.is_visible(low, high, least)
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
+        return self.table.is_visible(low, high, least, nearby=nearby)
 
     def segment(self, optical: AbstractOpticalModel, s0: Scalar, s1: Scalar, dt: Scalar) -> tuple[Channels, Channels]:
         """Radiance that leaves a segment of length `dt` along which the scalar goes linearly from `s0` to `s1`, and its optical
