@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
+from scenes import perspective
 
 import jvr
 from jvr.fitting import checkpoint
