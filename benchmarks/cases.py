@@ -73,6 +73,34 @@ def gradient() -> dict[str, Any]:
     }
 
 
+def skipping() -> dict[str, Any]:
+    """The CT of a torso through presets whose first position lies above air, at 192^2: everything over what leaps over empty bricks, for
+    pictures and for gradients in voxels, colours and extinctions."""
+    path = Path(os.environ.get("JVR_DATA", "data")) / "ct_torso" / "example_ct.nii.gz"
+    if not path.exists():
+        return {"skipped": "needs the CT of a torso of the public volumes: set JVR_DATA to their folder"}
+    scanned, found = jvr.read_volume(path), {}
+    volume = jvr.Volume(scanned.values.astype(np.float32), scanned.world_from_grid)
+    camera = scenes.camera(volume, 192)
+    into = {"voxels": lambda s: s.volume.values, "colours": lambda s: s.transfer.rgb, "extinctions": lambda s: s.transfer.sigma_t}
+    for name in ("ct_bone", "ct_soft_tissue", "ct_vessels"):
+        scene = jvr.Scene(volume, getattr(jvr.presets, name)())
+        functions: dict[str, Any] = {}
+        for kind, choices in (("on", jvr.Settings()), ("off", jvr.Settings(skipping=False))):
+            functions[f"image_{kind}"] = lambda choices=choices, scene=scene: jvr.render(scene, camera, choices).rgb
+            for unknown, place in into.items() if name == "ct_bone" else ():
+                loss = lambda u, choices=choices, scene=scene, place=place: jnp.mean(
+                    jnp.square(jvr.render(eqx.tree_at(place, scene, u), camera, choices).rgb - 0.5)
+                )
+                gradient = jax.jit(jax.value_and_grad(loss))
+                functions[f"{unknown}_{kind}"] = lambda gradient=gradient, start=place(scene): gradient(start)
+        times = seconds(functions, repeats=5)
+        for measured in sorted({key.rsplit("_", 1)[0] for key in functions}):
+            found[f"{name}_{measured}_seconds"] = median(times, f"{measured}_on")
+            found[f"{name}_{measured}_everything_over_visible"] = ratio(times, f"{measured}_off", f"{measured}_on")
+    return found
+
+
 def parts() -> dict[str, Any]:
     """Image and gradient in a transfer function: in parts, as a function that is not compiled as a whole has it, over one program."""
     volume, settings, found = scenes.gyroid(), jvr.Settings(0.5), {}
@@ -124,7 +152,7 @@ def fitting() -> dict[str, Any]:
     observations = observe(start, cameras, images, None, settings, chunk)
     kept = keep_samples(start, observations, settings, chunk, 2**31)
     assert kept is not None
-    through, rays = observed_medium(start, kept[1], kept[0], settings, seen_in_fit(start, settings))
+    through, rays = observed_medium(start, kept[1], kept[0], settings, seen_in_fit(start, settings, False))
     plain = jax.jit(yardsticks.kept_march)
     dt = step_length(start, settings)
     jax.block_until_ready(plain(through, rays, dt))
@@ -179,6 +207,7 @@ def startup() -> dict[str, Any]:
 CASES = {
     "forward": forward,
     "gradient": gradient,
+    "skipping": skipping,
     "parts": parts,
     "memory": memory,
     "light": light,

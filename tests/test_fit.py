@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
+from scenes import perspective
 
 import jvr
 from jvr.fitting import checkpoint
@@ -427,3 +428,26 @@ def test_residuals_are_rendered_minus_target():
     wide = jvr.PerspectiveCamera(CAMERAS[0].world_from_camera, 30.0, 4, 3)
     parts = jvr.residuals(START, (CAMERAS[0], wide), [IMAGES[0], np.zeros((3, 4, 3))], SETTINGS)
     assert [part.shape for part in parts] == [(15, 16, 3), (3, 4, 3)]
+
+
+@pytest.mark.parametrize("of", ["colours", pytest.param("voxels", marks=pytest.mark.slow)])
+def test_a_fit_leaps_over_what_has_no_derivative(of):
+    """Mostly empty at the start: the same iterations with leaps and without."""
+    values = np.zeros((17, 17, 17), np.float32)
+    values[6:10, 6:10, 6:10] = np.random.default_rng(0).uniform(0.3, 1.0, (4, 4, 4))
+    transfer = jvr.LinearTransfer([0.1, 0.5, 1.0], np.random.default_rng(1).random((3, 3)), [0.0, 0.2, 0.6])
+    truth = jvr.Scene(jvr.Volume(values), transfer)
+    camera = perspective(truth.volume, 10, 9)
+    image = jvr.render(truth, camera).rgb
+    if of == "colours":
+        start, unknowns = eqx.tree_at(lambda s: s.transfer.rgb, truth, jnp.full((3, 3), 0.5)), lambda s: s.transfer.rgb
+    else:
+        start, unknowns = eqx.tree_at(lambda s: s.volume.values, truth, 0.8 * truth.volume.values), lambda s: s.volume.values
+    solver = None if of == "colours" else optx.LBFGS(rtol=1e-6, atol=1e-8)
+    on, off = (
+        jvr.fit(start, [camera], [image], unknowns=unknowns, settings=jvr.Settings(skipping=s), solver=solver, max_steps=4)
+        for s in (True, False)
+    )
+    np.testing.assert_allclose([h.loss for h in on.history], [h.loss for h in off.history], rtol=1e-3, atol=1e-10)
+    np.testing.assert_allclose(unknowns(on.scene), unknowns(off.scene), atol=2e-3)
+    assert on.history[-1].loss < 0.8 * off.history[0].loss

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -330,12 +331,57 @@ def test_computed_beforehand_and_in_the_picture_are_the_same(tmp_path):
     np.testing.assert_allclose(picture(jvr.precompute(lit, cache=tmp_path)), picture(lit), atol=1e-5)
 
 
+@pytest.mark.parametrize("bleeding", [None, pytest.param(jvr.MaterialBleeding(), marks=pytest.mark.slow)])
+def test_what_was_computed_for_another_scene_is_refused(bleeding):
+    """With arrays at hand, and where the scene is an argument of a compiled function."""
+    frozen = jvr.precompute(scene(transfer=jvr.RadianceTransfer(rays=4, resolution=0.4, bleeding=bleeding)))
+    camera, volume = perspective(frozen.volume, width=4, height=4), frozen.volume
+    compiled_render = compiled(lambda s: jvr.render(s, camera, SETTINGS).rgb)
+    expected = compiled_render(frozen)
+    assert np.any(expected > 0)
+    # Equal numbers in other arrays are no other scene.
+    np.testing.assert_array_equal(compiled_render(jax.tree.map(jnp.array, frozen)), expected)
+    relit = dataclasses.replace(frozen, environment=light(seed=7))
+    assert relit.radiance_transfer.outdated(relit) == ()
+    changed = {
+        "transfer function": dataclasses.replace(frozen, transfer=linear_transfer(seed=5)),
+        "volume": dataclasses.replace(frozen, volume=jvr.Volume(voxels(volume.shape, seed=9), OBLIQUE)),
+        "one voxel": eqx.tree_at(lambda s: s.volume.values, frozen, volume.values.at[2, 3, 1].add(1e-6)),
+        "slope": eqx.tree_at(lambda s: s.volume.slope, frozen, 1.5 * volume.slope),
+        "place": eqx.tree_at(lambda s: s.volume.world_from_grid, frozen, 1.1 * volume.world_from_grid),
+        "interpolation": dataclasses.replace(
+            frozen, volume=jvr.Volume(volume.values, volume.world_from_grid, interpolation=jvr.Nearest())
+        ),
+        "clipping": dataclasses.replace(frozen, clipping=jvr.ClippingBox(volume.center - 2, volume.center + 2)),
+    }
+    if bleeding is not None:
+        changed["material"] = dataclasses.replace(frozen, material=jvr.LambertBRDF(0.3))
+    for name, other in changed.items():
+        with pytest.raises(ValueError, match=r"another .*jvr.precompute\(scene\) again"):
+            jvr.render(other, camera, SETTINGS)
+        assert other.radiance_transfer.outdated(other), name
+    for name in ("transfer function", "one voxel"):
+        with pytest.raises(Exception, match=r"another .*jvr.precompute\(scene\) again"):
+            jax.block_until_ready(compiled_render(changed[name]))
+
+
 @pytest.mark.slow
-def test_an_outdated_transfer_is_announced():
-    frozen = jvr.precompute(scene(transfer=jvr.RadianceTransfer(rays=16), shape=(7, 9, 8)))
-    changed = dataclasses.replace(frozen, transfer=linear_transfer(seed=5))
-    with pytest.warns(RuntimeWarning, match="another transfer function"):
-        jvr.render(changed, perspective(changed.volume, width=4, height=4), SETTINGS)
+def test_what_is_refused_is_computed_again_or_pinned(tmp_path):
+    """Also where all but what changed is closed over."""
+    lit = scene(transfer=jvr.RadianceTransfer(rays=8, resolution=0.4))
+    changed = dataclasses.replace(lit, volume=jvr.Volume(voxels(lit.volume.shape, seed=9), OBLIQUE))
+    frozen = jvr.precompute(lit, cache=tmp_path)
+    camera = perspective(lit.volume, width=6, height=5)
+    of_voxels = compiled(lambda v: jvr.render(eqx.tree_at(lambda s: s.volume.values, frozen, v), camera, SETTINGS).rgb)
+    np.testing.assert_allclose(of_voxels(lit.volume.values), picture(lit), atol=1e-5)
+    with pytest.raises(Exception, match=r"another .*jvr.precompute\(scene\) again"):
+        jax.block_until_ready(of_voxels(changed.volume.values))
+    stale = dataclasses.replace(frozen, volume=changed.volume)
+    np.testing.assert_allclose(picture(jvr.precompute(stale, cache=tmp_path)), picture(changed), atol=1e-5)
+    pinned = dataclasses.replace(stale, radiance_transfer=stale.radiance_transfer.pinned())
+    with pytest.warns(RuntimeWarning, match="computed for another"):
+        shown = jvr.render(pinned, perspective(pinned.volume, width=6, height=5), SETTINGS).rgb
+    assert np.abs(shown - picture(changed)).max() > 1e-3
 
 
 def test_single_voxels_and_opaque_insides_have_no_nan():

@@ -5,13 +5,15 @@ sections 4 and 4.1), projected on spherical harmonics at the nodes of a coarse g
 import dataclasses
 import itertools
 import math
+import warnings
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.core import Tracer
+from jaxtyping import Array, Float, UInt32
 
 from jvr.effects.natural_light import NaturalLight
 from jvr.effects.shading import share_of
@@ -19,8 +21,9 @@ from jvr.march.medium import Medium
 from jvr.march.segments import classify_at
 from jvr.march.steps import Point
 from jvr.model.dipole import Dipole
-from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer
+from jvr.model.effects import AbstractRadianceTransfer
 from jvr.model.harmonics.basis import basis, count
+from jvr.model.kept import content
 from jvr.model.light import perpendicular
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import ClippingBox, Volume
@@ -57,16 +60,18 @@ class ProjectedTransfer(eqx.Module):
     - `chroma`: `(x, y, z, 2, fewer bands)` holds orange-blue and green-purple differences (YCoCg); else `None`.
     - `solid`: `(x, y, z)`, how much of an opaque surface there is, from above 0 to 1; 0 where nothing is near and nothing was projected.
     - `facing`: `(x, y, z, 3)`, the unit vector away from the medium, shorter where that has hardly a direction.
-    - `made_for`: the numbers of the transfer function, of the material where that is part of it, and whether that has a normal.
+    - `made_for`: checksums of what it was made of (`jvr.model.kept.content`).
     - `scattered`: whether the scattering pass has been made.
+    - `pinned`: whether it stays as it is although the scene is another.
     """
 
     luminance: Float[Array, "x y z channels bands"]
     chroma: Float[Array, "x y z 2 fewer"] | None
     solid: Float[Array, "x y z"]
     facing: Float[Array, "x y z 3"]
-    made_for: Float[Array, "numbers"]
+    made_for: UInt32[Array, "parts 2"]
     scattered: bool = eqx.field(static=True, default=False)
+    pinned: bool = eqx.field(static=True, default=False)
 
     @property
     def coefficients(self) -> Float[Array, "x y z channels bands"]:
@@ -113,8 +118,8 @@ class RadianceTransfer(AbstractRadianceTransfer):
     - `memory`: bytes that the coefficients may take.
 
     Differentiable in transfer function, voxels, material and scattering while it is not projected; then each picture does it anew.
-    `jvr.precompute(scene)` does it once and keeps the result, which is then a constant: camera and light may change, the transfer
-    function should not. **Raises** `ValueError` for numbers outside their ranges.
+    `jvr.precompute(scene)` does it once and keeps the result, which is then a constant: camera and light may change; what it was made of
+    may not, unless it is `pinned()`. **Raises** `ValueError` for numbers outside their ranges.
     """
 
     order: int = eqx.field(static=True)
@@ -175,16 +180,46 @@ class RadianceTransfer(AbstractRadianceTransfer):
         self.termination, self.surface = float(termination), float(surface)
         self.bleeding, self.scattering, self.projected = bleeding, scattering, None
 
-    def outdated(self, transfer: AbstractTransfer, material: AbstractMaterial | None) -> tuple[str, ...]:
+    def outdated(self, scene: Any) -> tuple[str, ...]:
+        if self.projected is None or not np.any(self._differs(scene)):
+            return ()
+        return (self._stale,)
+
+    def checked(self, scene: Any) -> "RadianceTransfer":
         if self.projected is None:
-            return ()
-        now, then = self.made_for(transfer, material), self.projected.made_for
-        if now.shape == then.shape and np.allclose(np.asarray(now), np.asarray(then), rtol=1e-6, atol=0):
-            return ()
-        what = "transfer function or material"
+            return self
+        differs, is_pinned = self._differs(scene), self.projected.pinned
+        if isinstance(differs, Tracer):
+            if is_pinned:
+                return self
+            proven = eqx.error_if(self.projected.luminance, differs, self._stale)
+            return eqx.tree_at(lambda t: t.projected.luminance, self, proven)
+        if differs and not is_pinned:
+            raise ValueError(self._stale)
+        if differs:
+            warnings.warn(self._stale, RuntimeWarning, stacklevel=4)
+        return self
+
+    def pinned(self) -> "RadianceTransfer":
+        return self if self.projected is None else self.with_projected(dataclasses.replace(self.projected, pinned=True))
+
+    @property
+    def _stale(self) -> str:
+        what = ("transfer function", "volume", "clipping box", *(["material"] if self.needs_gradient else []), "or dipole")
         return (
-            f"the radiance transfer was computed for another {what}: call jvr.precompute with a scene that has not been through it",
+            f"the radiance transfer was computed for another {', '.join(what)}: call jvr.precompute(scene) again, or, to see the scene "
+            "with that of the other one, replace radiance_transfer by radiance_transfer.pinned()"
         )
+
+    def _differs(self, scene: Any) -> Any:
+        """Whether it was computed for another scene: a `bool`, or a traced one."""
+        assert self.projected is not None
+        now, then = self.made_for(scene), self.projected.made_for
+        if now.shape != then.shape:
+            return True
+        if isinstance(now, Tracer) or isinstance(then, Tracer):
+            return jnp.any(now != then)
+        return bool(np.any(np.asarray(now) != np.asarray(then)))
 
     def coarser(self) -> tuple[AbstractRadianceTransfer, ...]:
         # Of what has been computed beforehand nothing can be saved but the exact product.
@@ -236,11 +271,16 @@ class RadianceTransfer(AbstractRadianceTransfer):
                 f"a resolution of {fits:.2f} fits, or raise memory"
             )
 
-    def made_for(self, transfer: AbstractTransfer, material: AbstractMaterial | None) -> Float[Array, "numbers"]:
-        """What a projection depends on apart from the volume, as numbers."""
-        parts = (transfer, material) if isinstance(self.bleeding, MaterialBleeding) else (transfer,)
-        normal = [] if material is None else [jnp.full(1, float(material.needs_gradient))]
-        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(parts)] + normal)
+    def made_for(self, scene: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
+        """Checksums of all that a projection depends on."""
+        volume = scene.volume
+        parts = [volume.values, volume.slope, volume.intercept, volume.world_from_grid, volume.interpolation]
+        parts += [scene.transfer, scene.clipping, scene.normals if self.needs_gradient or scene.transfer.takes_gradient else None]
+        parts.append(scene.material if self.needs_gradient else None)
+        # Above a surface rays begin in front of it.
+        parts.append(np.array([scene.material is not None and scene.material.needs_gradient]))
+        is_scattered = self.scattering is not None and (self.projected is None or self.projected.scattered)
+        return content((parts, self.scattering if is_scattered else None))
 
     def boundaries(self, shape: tuple[int, int, int]) -> np.ndarray:
         """Ends of the steps of a ray, as shares of the volume's diameter."""

@@ -165,7 +165,7 @@ def finished(
     """What was projected, scattered and with its colour differences apart where the scene asks for that."""
     transfer = transfer_of(scene)
     shape = transfer.shape(scene.volume)
-    made_for = transfer.made_for(scene.transfer, scene.material)
+    made_for = jnp.asarray(transfer.made_for(scene))
     grid, around = coefficients.reshape(*shape, *coefficients.shape[1:]), around.reshape(*shape, 4)
     projected = ProjectedTransfer(grid, None, around[..., 0], around[..., 1:], made_for)
     projected = projected if transfer.scattering is None else scattered(scene, projected)

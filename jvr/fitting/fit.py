@@ -19,7 +19,7 @@ from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.minimisers import OptimistixSolver
 from jvr.fitting.objective import Problem, march_unknowns
-from jvr.fitting.observations import Observations, check_images, keep_samples, observe
+from jvr.fitting.observations import Observations, check_images, is_mostly_empty, keep_samples, observe
 from jvr.fitting.solvers import AbstractSolver
 from jvr.fitting.unknowns import Exposed, Unknowns, choose_unknowns
 from jvr.fitting.work import Work, fingerprint
@@ -36,6 +36,8 @@ CHUNK = 16_384
 KEEP_LIMIT = 2**30
 # The Jacobian of other unknowns than a table's entries takes one march for each.
 MOST_FORWARD = 512
+# Parts of a scene that radiance transfer is computed from: what was computed beforehand stays that of the start.
+SHAPE_LIGHT = ("scene.transfer", "scene.volume", "scene.clipping", "scene.material")
 
 
 class Iteration(NamedTuple):
@@ -150,8 +152,11 @@ def fit(
         # What the volume keeps would be that of the start.
         kept = lambda m: (m.scene.volume.bricks, m.scene.volume.gradients)
         model = eqx.tree_at(kept, model, (None, None), is_leaf=lambda x: x is None)
-        scene, chosen = model.scene, _choose(model, unknowns, transforms, solver)
-    problem = Problem(model, chosen, settings, loss, tuple(priors), None)
+    if scene.radiance_transfer is not None and any(name.startswith(SHAPE_LIGHT) for name in chosen.names):
+        model = eqx.tree_at(lambda m: m.scene.radiance_transfer, model, scene.radiance_transfer.pinned())
+    scene, chosen = model.scene, _choose(model, unknowns, transforms, solver)
+    start = chosen.model_from_real(model, chosen.real_from_model(model))
+    problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
     _check(problem, solver)
 
     chunk = min(CHUNK, sum(camera.width * camera.height for camera in cameras))

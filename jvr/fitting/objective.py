@@ -39,13 +39,14 @@ class Problem(eqx.Module):
     loss: Any  # AbstractLoss, or DSSIM for solvers that use gradients alone
     priors: tuple[AbstractPrior, ...]
     samples: Samples | None
+    leaps: bool = eqx.field(static=True, default=False)  # over empty bricks, in what has no derivative there
 
     def with_samples(self, samples: Samples) -> "Problem":
-        return Problem(self.model, self.unknowns, self.settings, self.loss, self.priors, samples)
+        return Problem(self.model, self.unknowns, self.settings, self.loss, self.priors, samples, self.leaps)
 
     def least_squares(self) -> "Problem":
         """The same unknowns and data, the squared error alone."""
-        return Problem(self.model, self.unknowns, self.settings, SquaredError(), (), self.samples)
+        return Problem(self.model, self.unknowns, self.settings, SquaredError(), (), self.samples, self.leaps)
 
 
 class _Channel(NamedTuple):
@@ -83,7 +84,7 @@ def predict(problem: Problem, model: Exposed, gathered: Marched, length: Float[A
 def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Scalar:
     """Mean loss over all pixels plus priors, as a function of the unknowns on the real line. `pieces` has a leading axis of chunks."""
     model = problem.unknowns.model_from_real(problem.model, real)
-    seen = seen_in_fit(model.scene, problem.settings)
+    seen = seen_in_fit(model.scene, problem.settings, problem.leaps)
 
     def add_piece(sum_: Scalar, piece: Observations) -> tuple[Scalar, None]:
         r = residual(problem, model, piece, seen)
@@ -109,7 +110,7 @@ def image_value(
     """`value` for a loss over whole images: the mean over images plus priors."""
     model = problem.unknowns.model_from_real(problem.model, real)
     settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
-    losses, where = [], seen_in_fit(model.scene, settings)
+    losses, where = [], seen_in_fit(model.scene, settings, problem.leaps)
     for camera, target in zip(cameras, images, strict=True):
         size = (camera.height, camera.width)
         gathered, rays, _ = trace(model.scene, camera, settings, pixels_of(all_blocks(*size), *size), where=where)
@@ -154,7 +155,8 @@ def _prepared(problem: Problem, values: Float[Array, "unknowns"]) -> Prepared:
     kinds = _Kinds.of(problem)
 
     def around(part: Array) -> tuple[Any, Any]:
-        return eqx.partition(seen_in_fit(kinds.changed(part, values).scene, problem.settings).shadows, eqx.is_inexact_array)
+        seen = seen_in_fit(kinds.changed(part, values).scene, problem.settings, problem.leaps)
+        return eqx.partition(seen.shadows, eqx.is_inexact_array)
 
     part = values[kinds.inner]
     if not part.size:
@@ -217,7 +219,7 @@ def _jacobian(
 
     def observed(scene: Scene, arrays: Any) -> tuple[Medium, Rays]:
         visible = None if around is None else eqx.combine(arrays, rest)
-        seen = seen_in_fit(scene, problem.settings, visible)
+        seen = seen_in_fit(scene, problem.settings, problem.leaps, visible)
         return observed_medium(scene, piece, problem.samples, problem.settings, seen)
 
     def of_inner(part: Array, arrays: Any) -> tuple[Triple, Marched]:
@@ -229,7 +231,8 @@ def _jacobian(
     medium, rays = observed(model.scene, arrays)
     gathered = None
     if kinds.entries:
-        gathered, rows = table_rows(options, medium, rays, step_length(model.scene, problem.settings))
+        dt, of_extinctions = step_length(model.scene, problem.settings), "scene.transfer.sigma_t" in kinds.entries
+        gathered, rows = table_rows(options, medium, rays, dt, of_extinctions=of_extinctions)
         _add_entries(problem, model, gathered, rows, rays.length, kinds.entries, blocks)
     if kinds.inner.size:
         point = (values[kinds.inner], arrays)

@@ -69,7 +69,7 @@ class ResidualFunction(eqx.Module):
 
     def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
         model = self.problem.unknowns.model_from_real(self.problem.model, real)
-        adjoint, seen = adjoint_of(self.problem), seen_in_fit(model.scene, self.problem.settings)
+        adjoint, seen = adjoint_of(self.problem), seen_in_fit(model.scene, self.problem.settings, self.problem.leaps)
 
         def of_piece(piece: Observations) -> Array:
             scale = jnp.sqrt(piece.weight / self.total)

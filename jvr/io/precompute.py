@@ -18,6 +18,7 @@ from jvr.effects.radiance_transfer import MaterialBleeding, ProjectedTransfer
 from jvr.effects.transfer_grid import TransferProjection, finished, project_all, transfer_of
 from jvr.io.images import replacing
 from jvr.model.scene import Scene
+from jvr.model.volume import Volume
 from jvr.parallel import in_threads, workers
 from jvr.rendering.medium import absorbing, occupancy
 from jvr.rendering.settings import Settings
@@ -55,9 +56,9 @@ def precompute(
     any environment do neither again. The material is kept up to order 3, or that of the environment (with an exact product, of the
     transfer) where it is higher: of an environment of a still higher order no more than that is seen.
 
-    Both are constants from then on. After a change of the volume, the transfer function, the clipping box, or the settings of
-    `radiance_transfer`, compute again from a scene that has not been through here; a new material asks for it only with
-    `jvr.MaterialBleeding()`. `jvr.render` warns where the transfer function is not the one that it was made for.
+    Both are constants from then on. After a change of the volume, the transfer function or the clipping box call it again, which computes
+    what is of another scene anew (else `jvr.render` raises); a new material asks for it only with `jvr.MaterialBleeding()`. After a change
+    of the settings of `radiance_transfer`, begin with a scene that has not been through here.
 
     **Arguments:** `cache`: a folder to keep results in, named by the content of what they were computed from; `progress`: called with the
     share that is done, 0 ... 1; `report`: called with each part once it is there; `keep_material`: leave the material as it is, and
@@ -67,7 +68,7 @@ def precompute(
     environment = scene.environment
     if environment is None:
         return scene
-    scene = scene.current()
+    scene = dataclasses.replace(scene, volume=scene.volume.current())
     folder = None if cache is None else Path(cache)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -78,15 +79,19 @@ def precompute(
         project = lambda inputs: inputs[0].projected(order)
         projected = _kept(folder, project, material, lambda: _projected(scene.material, order), "material", report)
         scene = dataclasses.replace(scene, material=projected)
-    if scene.radiance_transfer is None or scene.radiance_transfer.is_frozen:
+    if scene.radiance_transfer is None:
         return scene
+    if scene.radiance_transfer.is_frozen:
+        if not scene.radiance_transfer.outdated(scene):
+            return scene
+        scene = eqx.tree_at(lambda s: s.radiance_transfer.projected, scene, None)
     transfer = transfer_of(scene)
     if keep_unscattered and transfer.scattering is not None:
         scene = eqx.tree_at(lambda s: s.radiance_transfer.scattering, scene, None)
     # The light plays no part, and the material where rays do not pick up its colour none but that it has a normal.
     plays, normal = isinstance(transfer.bleeding, MaterialBleeding), scene.material is not None and scene.material.needs_gradient
     inputs = (
-        scene.volume,
+        _bare(scene.volume),
         scene.transfer,
         scene.clipping,
         scene.normals,
@@ -101,6 +106,12 @@ def precompute(
 
 
 _projected = jax.jit(lambda material, order: material.projected(order), static_argnums=1)
+
+
+def _bare(volume: Volume) -> Volume:
+    """The volume without what it keeps of its voxels."""
+    kept = lambda v: (v.bricks, v.squares, v.gradients)
+    return eqx.tree_at(kept, volume, (None, None, None), is_leaf=lambda x: x is None)
 
 
 def as_precomputed(scene: Scene) -> Scene:

@@ -104,8 +104,17 @@ class AbstractRadianceTransfer(eqx.Module):
         """How far above a surface, in the world, it is known what arrives."""
 
     @abc.abstractmethod
-    def outdated(self, transfer: Any, material: AbstractMaterial | None) -> tuple[str, ...]:
-        """What has to be computed again for this transfer function and material, in a sentence; empty where nothing has."""
+    def outdated(self, scene: Any) -> tuple[str, ...]:
+        """What has to be computed again for a scene of arrays at hand, in a sentence; empty where nothing has."""
+
+    @abc.abstractmethod
+    def checked(self, scene: Any) -> "AbstractRadianceTransfer":
+        """The same, for a scene that it has not been computed for an error: a `ValueError`, or, where that is traced, when the program
+        runs. Where it is `pinned` a warning, of arrays at hand."""
+
+    @abc.abstractmethod
+    def pinned(self) -> "AbstractRadianceTransfer":
+        """The same, to be taken as it is whatever becomes of the scene that it was computed for."""
 
     def coarser(self) -> tuple["AbstractRadianceTransfer", ...]:
         """Cheaper ways to about the same light, one notch coarser."""

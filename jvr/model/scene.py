@@ -90,9 +90,13 @@ class Scene(eqx.Module):
         _check_environment(self)
 
     def current(self) -> "Scene":
-        """The same scene with `Volume.current()`: what draws it begins here."""
+        """The same scene with nothing in it that was computed for another: `Volume.current()`, and radiance transfer `checked`. What draws
+        a scene begins here."""
         volume = self.volume.current()
-        return self if volume is self.volume else eqx.tree_at(lambda s: s.volume, self, volume)
+        scene = self if volume is self.volume else eqx.tree_at(lambda s: s.volume, self, volume)
+        if self.radiance_transfer is None:
+            return scene
+        return eqx.tree_at(lambda s: s.radiance_transfer, scene, self.radiance_transfer.checked(self))
 
     @property
     def material_order(self) -> int:

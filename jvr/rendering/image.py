@@ -2,7 +2,6 @@
 
 import functools
 import math
-import warnings
 from typing import Any
 
 import equinox as eqx
@@ -59,11 +58,9 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
     enter and leave the volume. Detached: the number of segments, early termination, and which samples `settings.sampling` takes.
     `settings.adjoint` says in which mode.
     Traceable; `jax.jit(jvr.render)` compiles once for each structure of the scene, size of the picture and settings. A camera
-    with non-finite numbers gives NaN pixels. **Raises** `ValueError` where `settings.sampling` does not support the scene.
+    with non-finite numbers gives NaN pixels. **Raises** `ValueError` where `settings.sampling` does not support the scene, and where its
+    radiance transfer was computed for another (within a compiled program, an error when that runs).
     """
-    if scene.radiance_transfer is not None and not is_traced(scene):
-        for problem in scene.radiance_transfer.outdated(scene.transfer, scene.material):
-            warnings.warn(problem, RuntimeWarning, stacklevel=2)
     return settings.sampling.render(scene.current(), camera, settings)
 
 
