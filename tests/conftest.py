@@ -16,6 +16,13 @@ import pytest
 DATA = Path(os.environ.get("JVR_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _programs_go():
+    """Compiled programs are let go after each file: a process may hold 65,530 maps of memory, and each program takes several."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def x64():
     """Double precision for one test."""

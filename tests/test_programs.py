@@ -1,6 +1,7 @@
 """Derivatives of what is not compiled itself run as compiled programs, which are kept as long as somebody may want them."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.monitoring
@@ -11,6 +12,7 @@ from scenes import compiled, linear_transfer, perspective, voxels
 
 import jvr
 
+MAPS = Path("/proc/self/maps")
 compilations = []
 jax.monitoring.register_event_duration_secs_listener(
     lambda event, seconds, **_: compilations.append(event) if event == "/jax/core/compile/backend_compile_duration" else None
@@ -98,3 +100,44 @@ def test_derivatives_that_are_not_compiled_are_one_program(case, what):
     expected = compiled(derivative)(value)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * np.abs(b).max())
+
+
+def maps():
+    """How many pieces of memory the process has mapped; Linux alone lists them."""
+    return len(MAPS.read_text().splitlines()) if MAPS.exists() else 0
+
+
+def test_fits_of_one_kind_share_their_programs_and_cleared_ones_are_gone():
+    """With other numbers and another function that names the unknowns nothing is compiled; each program takes memory maps."""
+    jax.clear_caches()
+    before = maps()
+
+    def fit(seed):
+        truth = dataclasses.replace(scene(), transfer=linear_transfer(seed=seed))
+        camera = perspective(truth.volume, 4, 3)
+        image = np.full((3, 4, 3), 0.1 * seed, np.float32)
+        jvr.fit(truth, [camera], [image], unknowns=lambda s: s.transfer.sigma_t, max_steps=1, progress=False)
+
+    fit(1)
+    held = maps()
+    compilations.clear()
+    fit(2)
+    assert not compilations
+    if MAPS.exists():
+        assert maps() - held < 50
+        jax.clear_caches()
+        assert held - maps() > 0.6 * (held - before) > 100
+
+
+@pytest.mark.slow
+def test_measurements_share_their_programs():
+    """Whichever function names the unknowns."""
+    base = scene()
+
+    def measure():
+        jvr.measure(base, perspective(base.volume, 7, 5), [jvr.Settings()], unknowns=lambda s: s.transfer.sigma_t, repeats=1)
+
+    measure()
+    compilations.clear()
+    measure()
+    assert not compilations
