@@ -365,7 +365,8 @@ def test_held_out_views_are_scored():
     image = jvr.render(TRUTH, camera, SETTINGS).rgb
     ((decibels, similarity),) = fit(max_steps=30, held_out=((camera,), [image])).stats.held_out
     assert decibels > 60
-    assert 0.99 < similarity <= 1
+    # A fit without an error: what is above 1 is the rounding of single precision.
+    assert 0.99 < similarity <= 1 + 1e-6
 
 
 @pytest.mark.slow
