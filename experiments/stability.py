@@ -256,7 +256,7 @@ def placed_rows(quick: bool) -> dict[str, list[Case]]:
         ],
         "labels": [labels],
         "voxel (0, 0, 0) is NaN, and clipped": [hidden],
-        "no data: voxels of -3.4e38": [base(values=unknown, world=np.eye(4), label="-3.4e38")],
+        "no data: voxels of -3.4e38": [base(values=unknown, extinction=(0.0, 0.5, 0.3, 0.6), world=np.eye(4), label="-3.4e38")],
         "spot of 0.01 ... 60 degrees": [base(world=np.eye(4), lights=spot(a), label=f"{a:g}") for a in pick([0.01, 1.0, 60.0])],
     }
 

@@ -21,7 +21,8 @@ class CutFaces(eqx.Module):
     layer: Scalar
 
     def normal(self, x: Triple, normal: Triple) -> tuple[Triple, Scalar]:
-        """The unit normal of a point in the world, whose gradient has the unit `normal` or zero, and the share of it that is a cut.
+        """The unit normal of a point in the world, and the share of it that is a cut. `normal`: that of its gradient, as long as the share
+        of the point that is a surface.
         Differentiable; detached: which of two opposite faces is nearer."""
         outward, share = [], jnp.zeros_like(x[0])
         for c, low, high in zip(x, self.box.lower, self.box.upper, strict=True):

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from jvr.effects.cut import CutFaces
 from jvr.effects.own_shadow import Segment
+from jvr.effects.shading import share_of
 from jvr.march.shaders import OpticalShader, PreIntegratedShader
 from jvr.march.steps import Point, Sample
 from jvr.model.by_value import at_value
@@ -48,9 +49,13 @@ class LitShader(OpticalShader):
         w_o, _ = direction_and_length(turned(-self.world_from_grid[:3, :3], point.direction))
         shading, scattering = at_value((self.shading, self.scattering), sample.s)
         normal, magnitude = direction_and_length(tuple(-g for g in sample.gradient)) if sample.gradient else ((zero,) * 3, zero)
-        normal, cut = (normal, zero) if self.cut is None else self.cut.normal(x, normal)
         surface = zero if shading is None else shading.surface_share(magnitude)
-        surface = surface + cut * (1 - surface)
+        cut = zero
+        if self.cut is not None:
+            # What is hardly a surface has hardly a say in the normal.
+            share = surface if self.natural is None or shading is not None else share_of(magnitude, self.natural.threshold)
+            normal, cut = self.cut.normal(x, tuple(share * n for n in normal))
+            surface = surface + cut * (1 - surface)
         scatters = zero + 1 if scattering is None or not scattering.needs_gradient else scattering.share(magnitude)
         # Where there is a switch, what is not a surface scatters and does not reflect.
         reflects = 1 - scatters if scattering is not None and scattering.needs_gradient else zero + 1
