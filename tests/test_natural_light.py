@@ -505,7 +505,7 @@ def test_parts_of_another_kind_are_refused(wrong):
 @pytest.mark.slow
 def test_memory_counts_every_channel():
     coloured = linear_transfer(coloured=True)
-    transfer = jvr.RadianceTransfer(3, 4, 1.0, memory=4 * 5 * 6 * 7 * 17)
+    transfer = jvr.RadianceTransfer(3, 4, 1.0, memory=4 * 5 * 6 * 7 * 20)
     picture(scene(transfer=transfer))
     with pytest.raises(ValueError, match="raise memory"):
         picture(dataclasses.replace(scene(transfer=transfer), transfer=coloured))

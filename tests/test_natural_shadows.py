@@ -6,9 +6,13 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scenes import rotation
+import pytest
+from scenes import compiled, rotation
+from scipy.special import expn
 
 import jvr
+from jvr.effects.own_shadow import OwnShadow, Segment
+from jvr.model.transfer import Classified
 
 TILT = rotation(0.25, 0.1, 0.35)
 TOWARDS, HALF_ANGLE = np.array([0.5, -0.45, 0.74]) / np.linalg.norm([0.5, -0.45, 0.74]), 12.0
@@ -58,7 +62,7 @@ def lamp_and_sky(name):
 
 
 def brute_force(scene, camera, directions, irradiance):
-    """The picture under lights with shadow rays, one after the other, and where it shows the inside of a face."""
+    """The picture under lights with shadow rays, one after the other, its opacity and its depth."""
 
     def one(direction, irradiance):
         lit = dataclasses.replace(
@@ -78,18 +82,18 @@ def brute_force(scene, camera, directions, irradiance):
 def view(scene, size):
     center = np.asarray(scene.volume.center)
     eye = center + 1.6 * float(scene.volume.radius) * np.array([1.2, -1.6, 2.0])
-    return jvr.PerspectiveCamera.look_at(eye, center, (0, 0, 1), 28.0, size, size)
+    return jvr.PerspectiveCamera.look_at(eye, center, (0, 0, 1), 22.0, size, size)
 
 
 def seen(scene, camera, alpha, depth):
-    """Pixels inside of a face: not at the border of the picture of a body, nor where the volume cuts it."""
-    origin, direction = camera.rays(jnp.arange(alpha.size))
-    p = np.stack([np.asarray(o) + depth.ravel() * np.asarray(d) for o, d in zip(origin, direction, strict=True)], axis=-1)
-    border = 0.16 * scene.volume.shape[0]
-    inside = np.all((p > border) & (p < scene.volume.shape[0] - 1 - border), axis=-1).reshape(alpha.shape)
+    """Pixels of whole faces: no edge of the body in the picture, and nothing where the volume cuts it."""
     whole = alpha > 0.98
     around = [np.roll(whole, shift, (0, 1)) for shift in ((0, 1), (0, -1), (1, 0), (-1, 0))]
-    return np.all([whole, *around], axis=0) & (inside if np.all(whole[alpha.shape[0] // 2, alpha.shape[1] // 2]) else whole)
+    origin, direction = camera.rays(jnp.arange(alpha.size))
+    p = np.stack([np.asarray(o) + depth.ravel() * np.asarray(d) for o, d in zip(origin, direction, strict=True)], axis=-1)
+    n = scene.volume.shape[0]
+    uncut = np.all(np.abs(p - (n - 1) / 2) < 0.37 * n, axis=-1).reshape(alpha.shape)
+    return np.all([whole, uncut, *around], axis=0)
 
 
 def compared(name, which, n, size, transfer):
@@ -99,9 +103,42 @@ def compared(name, which, n, size, transfer):
     camera = view(plain, size)
     exact, alpha, depth = brute_force(plain, camera, directions, irradiance)
     lit = dataclasses.replace(plain, environment=environment, material=jvr.LambertBRDF(), radiance_transfer=transfer)
-    found = np.asarray(jax.jit(jvr.render, static_argnums=2)(lit, camera, SETTINGS).rgb, float)[..., 0]
-    wanted = seen(plain, camera, alpha, depth) if name == "half space" else seen_of_body(alpha)
+    found = np.asarray(compiled(jvr.render, static_argnums=2)(lit, camera, SETTINGS).rgb, float)[..., 0]
+    wanted = seen(plain, camera, alpha, depth)
     wanted &= exact > 0.1 * np.max(exact[wanted])
     ratio = found[wanted] / exact[wanted]
-    assert wanted.sum() > 30
+    assert wanted.sum() > 20
     return np.sum(found[wanted]) / np.sum(exact[wanted]), np.std(ratio) / np.mean(ratio)
+
+
+def test_shares_of_the_light_against_brute_force():
+    """Of 40 lights. The mean; and no blotches: what is left is a twentieth, mostly of the shadow rays' own steps."""
+    mean, spread = compared("ball", "both", 20, 16, jvr.RadianceTransfer(rays=16))
+    assert abs(mean - 1) < 0.05
+    assert spread < 0.06
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize("which", ["lamp", "sky", "both"])
+@pytest.mark.parametrize("name", ["ball", "box", "half space"])
+def test_bodies_against_brute_force(name, which, exact):
+    """The faces of a box meet in edges that a third of the voxels does not resolve."""
+    mean, spread = compared(name, which, 36, 40, jvr.RadianceTransfer(exact=exact))
+    assert abs(mean - 1) < 0.05
+    assert spread < (0.08 if name == "box" else 0.05)
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.05, 0.4, 2.0, 8.0])
+def test_the_shadow_that_a_surface_casts_on_itself(tau):
+    """Bands against SciPy's exponential integrals, for a scalar that falls to 0 within the width."""
+    # From 1 to 0 over a distance of 3 the integral of the scalar is 1.5.
+    linear = jvr.LinearTransfer([0.0, 1.0], [[1, 1, 1]] * 2, [0.0, tau / 1.5])
+    shadow = OwnShadow(linear, jnp.asarray(3.0), of_opacity=False, bleeds=False)
+    up, s = tuple(map(jnp.asarray, (0.0, 0.0, 1.0))), jnp.asarray(1.0)
+    slope = tuple(map(jnp.asarray, (0.0, 0.0, -1 / 3)))
+    here = Segment(Classified((s, s, s), (jnp.asarray(tau / 1.5),)), slope, jnp.asarray(0.0))
+    found = [band[0] for band in shadow.remaining(s, jnp.asarray(1 / 3), up, up, here, jnp.asarray(1.0))]
+    e = {n: expn(n, tau) for n in (3, 4, 5)}
+    # The rule of four places and the continued fraction are within a few percent of all light.
+    np.testing.assert_allclose(found, [2 * e[3], 3 * e[4], 4 * (3 * e[5] - e[3])], atol=0.04)

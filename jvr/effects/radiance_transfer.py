@@ -263,7 +263,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
         """**Raises** `ValueError` where the coefficients of all nodes would exceed `memory`."""
         extinctions = len(jax.eval_shape(transfer.evaluate, volume.intercept, volume.intercept).sigma_t)
         channels = extinctions if self.bleeding is None and self.scattering is None else 3
-        needed = volume.slope.dtype.itemsize * math.prod(self.shape(volume)) * (channels * count(self.order) + 1)
+        needed = volume.slope.dtype.itemsize * math.prod(self.shape(volume)) * (channels * count(self.order) + 4)
         if needed > self.memory:
             fits = self.resolution * (self.memory / needed) ** (1 / 3)
             raise ValueError(

@@ -195,18 +195,23 @@ def _shares(
 ) -> Float[Array, "x y z 3"]:
     """The share of each colour of the light that arrives, of all that a matte surface would reflect that faces where the node does; 0
     where there is no light."""
-    arriving = _products(coefficients, light, 2).reshape(*facing.shape[:3], 9, 3)
-    normal, strength = direction_and_length(tuple(jnp.moveaxis(facing, -1, 0)))
-    # A cosine over pi: band l of its coefficients is A_l / pi Y_lm(n). Without a surface all directions count alike.
-    band = band_of(2)
-    functions = jnp.stack(basis(2, normal), axis=-1) * np.array([1, 2 / 3, 1 / 4])[band]
-    functions = jnp.where(band > 0, strength[..., None] * functions, functions)
+    matrix = product_matrix(light, math.isqrt(coefficients.shape[-1]) - 1, 2)
+    channels = coefficients.shape[3]
+    flat = [coefficients[..., c, :].reshape(-1, coefficients.shape[-1]).T for c in range(channels)]
+    normal, length = direction_and_length(tuple(facing.reshape(-1, 3).T))
+    # A cosine over pi: band l of its coefficients is A_l / pi Y_lm(n). Without a direction all count alike.
+    kernel = [1.0, *(length * k for k in (2 / 3, 1 / 4))]
+    functions = [y * kernel[band] for y, band in zip(basis(2, normal), band_of(2), strict=True)]
     full = jnp.pad(light, ((0, max(9 - light.shape[0], 0)), (0, 0)))[:9]
-    own, whole = jnp.einsum("xyzb,xyzbh->xyzh", functions, arriving), functions @ full
-    # Where a surface faces no light the share is that of all light.
-    parts = ((own, arriving[..., 0, :]), (whole, full[0]))
-    own, whole = (jnp.maximum(faced, 0.0) + DARK * jnp.maximum(all_round, 0.0) for faced, all_round in parts)
-    return divide_or_zero(own, jnp.broadcast_to(whole, own.shape))
+    shares = []
+    for colour in range(3):
+        # Numbers of a node far from each other and those of all nodes side by side: one loop for all that follows.
+        arriving = matrix[..., colour] @ flat[colour % channels]
+        own, whole = (sum(y * v[i] for i, y in enumerate(functions)) for v in (arriving, full[:, colour]))
+        # Where a surface faces no light the share is that of all light.
+        own, whole = (jnp.maximum(v, 0.0) + DARK * jnp.maximum(r[0], 0.0) for v, r in ((own, arriving), (whole, full[:, colour])))
+        shares.append(divide_or_zero(own, whole))
+    return jnp.stack(shares, axis=-1).reshape(*facing.shape[:3], 3)
 
 
 def _products(
