@@ -83,6 +83,10 @@ def agree(one, other, tolerance):
     for (path, b), a in zip(jax.tree_util.tree_leaves_with_path(other), jax.tree.leaves(one), strict=True):
         name = jax.tree_util.keystr(path)
         a, b = (a[:3], b[:3]) if "world_from_grid" in name else (a, b)
+        if "remainder" in name:
+            # What rounding leaves of a position is detached, although it moves the position.
+            assert not np.any(a), name
+            continue
         scale = np.abs(b).max()
         assert scale > 0, name
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * scale, err_msg=name)

@@ -163,7 +163,8 @@ class ChunkedLeastSquares(AbstractSolver):
         loss, normal = functions.levels[int(state.level)](jnp.asarray(trial))
         finite = np.isfinite(loss) and all(np.all(np.isfinite(x)) for x in normal)
         with jax.enable_x64(True):
-            step_size, accept = _search(self.search, model, move, np.asarray(loss if finite else np.inf), state.step_size)
+            there = np.asarray(loss if finite else np.inf)
+            step_size, accept = _search(self.search, _arrays(model), move, there, state.step_size)
         if accept:
             after = _state(trial, loss, normal, step_size, state.level, 0, 0)
             return self._accepted(functions, state, after, model.promise(move))
@@ -223,8 +224,12 @@ def _within(functions: Functions, real: np.ndarray, move: np.ndarray) -> np.ndar
 
 
 def _state(*fields: Any) -> ChunkedState:
-    # Arrays all through: a Python number would be compiled in, and each step would compile anew.
-    return ChunkedState(*jax.tree.map(np.asarray, fields))
+    return ChunkedState(*_arrays(fields))
+
+
+def _arrays(tree: Any) -> Any:
+    """A Python number would be compiled in, and each step would compile anew."""
+    return jax.tree.map(np.asarray, tree)
 
 
 @eqx.filter_jit
