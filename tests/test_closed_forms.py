@@ -184,6 +184,7 @@ def test_error_of_early_termination_is_bounded_by_its_setting(termination):
     assert np.all(1 - np.asarray(ended.alpha)[short] <= termination * (1 + 1e-5))
 
 
+@pytest.mark.slow
 def test_tiles_and_the_pool_change_nothing(monkeypatch):
     """All rays at once, against a pool of lanes that is filled again on the way and against tiles that do not divide the picture."""
     volume = jvr.Volume(voxels(), OBLIQUE)

@@ -102,6 +102,7 @@ def check_every_way(p, names, rows=(jax.jacfwd, jax.grad), **options):
         agree(compiled(transform(make_loss(fixed, jvr.Rows(), **options)))(moving), replay, ROUNDING)
 
 
+@pytest.mark.slow
 def test_every_parameter_at_once(x64):
     p = parameters(TRANSFERS["linear"]())
     check_every_way(p, tuple(p), rows=(jax.grad,))

@@ -94,6 +94,7 @@ def test_the_head_and_its_maps_have_their_up_and_front_where_the_world_has_them(
 
 
 @pytest.mark.parametrize("name", ["shadowed_fit.toml", pytest.param("real/shadowed_fit.toml", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_configurations_of_the_shadowed_fit_describe_the_same_experiment(name, request):
     if name.startswith("real"):
         request.getfixturevalue("data")

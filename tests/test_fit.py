@@ -138,6 +138,7 @@ def test_normal_equations_have_the_gradient_of_the_objective(loss, names, x64):
     np.testing.assert_allclose(2 * normal.vector, gradient, rtol=1e-7, atol=1e-9 * np.abs(gradient).max())
 
 
+@pytest.mark.slow
 def test_chunks_do_not_matter(monkeypatch):
     whole = fit(max_steps=5)
     monkeypatch.setattr("jvr.fitting.fit.CHUNK", 160)

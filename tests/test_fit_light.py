@@ -67,6 +67,7 @@ def test_only_the_product_of_albedo_and_irradiance_is_determined(volume):
     assert product == pytest.approx(3.2, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_transfer_function_together_with_the_phase(volume):
     """Its entries shade each other: the Jacobian is taken through the shadows."""
     cameras, images = views(scene(volume))

@@ -265,6 +265,7 @@ def test_threshold_blends(x64):
         )
 
 
+@pytest.mark.slow
 def test_switch_between_surface_and_medium(x64):
     """With a threshold the share `t^2 / (m^2 + t^2)` scatters and the rest reflects; without, both are added."""
     t, phase = 0.2, jvr.HenyeyGreenstein(0.5)

@@ -394,6 +394,7 @@ def test_forward_mode_is_reverse_mode(make, x64):
     np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_as_users_compile_it():
     """All optimisations on: contracted products and fused loops."""
     table, ends = linear_transfer(scale=5.0), some_segments(count=280)
@@ -419,6 +420,7 @@ tables = st.sampled_from([2, 5]).flatmap(
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(table=tables, s0=st.floats(-2, 8), s1=st.floats(-2, 8), dt=st.floats(0, 2), equally=st.booleans())
+@pytest.mark.slow
 def test_any_table(table, s0, s1, dt, equally):
     gaps, rgb, sigma_t = (np.array(v) for v in table)
     with jax.enable_x64(True):

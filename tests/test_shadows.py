@@ -177,6 +177,7 @@ def test_shadow_map_is_detached(x64):
     assert np.all(np.asarray(of_irradiance) > 0)
 
 
+@pytest.mark.slow
 def test_deep_map_keeps_its_error_and_reports_where_it_cannot(x64):
     light = lights(cloud())["directional"]
     texels = 16

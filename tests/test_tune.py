@@ -72,6 +72,7 @@ def test_one_target_is_asked_for():
             tune.tune(SCENE, CAMERA, **wrong)
 
 
+@pytest.mark.slow
 def test_command(tmp_path, monkeypatch):
     monkeypatch.setenv("JVR_CACHE", "0")
     monkeypatch.setattr(tune, "STEPS", (2.0,))
