@@ -15,9 +15,10 @@ import numpy as np
 from jvr.io.volumes.arrays import read_npy, read_raw, read_zarr
 from jvr.io.volumes.dicom import read_dicom_file, read_dicom_folder
 from jvr.io.volumes.errors import VolumeError, first_bytes
+from jvr.io.volumes.given import Given
 from jvr.io.volumes.itk import read_metaimage, read_nrrd
 from jvr.io.volumes.nifti import read_nifti
-from jvr.io.volumes.stored import Stored, replaced_grid, to_volume
+from jvr.io.volumes.stored import Stored, replaced, to_volume
 from jvr.io.volumes.tiff import read_tiff
 from jvr.io.volumes.vtk_files import read_legacy_vtk, read_vti
 from jvr.model.volume import Volume
@@ -27,8 +28,8 @@ __all__ = ["VolumeError", "read_volume"]
 Numbers = float | int | Sequence[float | int] | np.ndarray
 
 RAW = (".raw", ".bin", ".dat")
-# For each ending: the reader and the keywords of `read_volume` that it takes.
-READERS: dict[str, tuple[Callable[..., Stored], tuple[str, ...]]] = {
+# For each ending: the reader and the keywords of `read_volume` that it takes, beside those that place and scale every volume.
+READERS: dict[str, tuple[Callable[[Path, Given], Stored], tuple[str, ...]]] = {
     ".mhd": (read_metaimage, ()),
     ".mha": (read_metaimage, ()),
     ".nrrd": (read_nrrd, ()),
@@ -49,6 +50,8 @@ MEANING = {
     "array": "array= names an array in a .vtk, .vti or .zarr, this file holds a single one",
     "series": "series= chooses among the DICOM series of a folder",
     "axes": "axes= orders the axes of .npy and .zarr, this format defines its own",
+    "channel": "channel= chooses one of several channels, this format has none",
+    "time": "time= chooses one of several points in time, this format has none",
 }
 
 
@@ -62,6 +65,11 @@ def read_volume(
     array: str | None = None,
     series: str | None = None,
     axes: str | None = None,
+    channel: int | str | None = None,
+    time: int | None = None,
+    direction: Sequence[Sequence[float]] | np.ndarray | None = None,
+    slope: float | None = None,
+    intercept: float | None = None,
     nan_value: float | int | None = None,
 ) -> Volume:
     """Reads a scalar volume and where it lies in the world (millimetres, LPS, as ITK reads it).
@@ -80,9 +88,12 @@ def read_volume(
     - `shape`, `dtype`: voxels along x, y, z (x fastest in the file) and NumPy type of a headerless file; ">i2" is big-endian.
     - `spacing`: millimetres between voxels along x, y, z, or one number for all, in place of what the file says (default 1).
     - `origin`: world position of voxel (0, 0, 0) in mm, in place of what the file says (default 0, 0, 0).
+    - `direction`: 3x3, unit vectors along x, y, z of the grid in its columns, in place of what the file says.
+    - `slope`, `intercept`: data units are `slope * stored + intercept`, in place of what the file says.
     - `array`: which array of a VTK file or Zarr group.
     - `series`: which DICOM series of a folder, by its id.
     - `axes`: the order of a NumPy or Zarr array's axes, such as "zyx"; default "xyz", or what a Zarr's metadata say.
+    - `channel`, `time`: which of several channels (its index from 0 or its name) and points in time (its index).
     - `nan_value`: number, in data units, that takes the place of NaN and infinite voxels.
 
     **Raises** `VolumeError` (a `ValueError`) with one line that names the file, what is wrong and what would be right, for
@@ -90,16 +101,26 @@ def read_volume(
     `FileNotFoundError`) where a file cannot be opened. Warns where float32 loses what sets float64 voxels apart.
     """
     path = Path(path).expanduser()
-    spacing_mm = _three(path, "spacing", [spacing] * 3 if isinstance(spacing, int | float) else spacing, positive=True)
-    origin_mm = _three(path, "origin", origin, positive=False)
+    given = Given(
+        shape=shape,
+        dtype=dtype,
+        spacing=_three(path, "spacing", [spacing] * 3 if isinstance(spacing, int | float) else spacing, positive=True),
+        origin=_three(path, "origin", origin, positive=False),
+        direction=_direction(path, direction),
+        slope=slope,
+        intercept=intercept,
+        array=array,
+        series=series,
+        axes=axes,
+        channel=channel,
+        time=time,
+    )
     if nan_value is not None and not math.isfinite(nan_value):
         raise VolumeError(path, f"nan_value={nan_value} must be a finite number")
-    given = {"shape": shape, "dtype": dtype, "array": array, "series": series, "axes": axes}
     reader, takes = _reader(path, raw=shape is not None and dtype is not None)
-    if superfluous := [key for key, value in given.items() if value is not None and key not in takes]:
+    if superfluous := [key for key in MEANING if getattr(given, key) is not None and key not in takes]:
         raise VolumeError(path, f"{MEANING[superfluous[0]]}: leave {superfluous[0]}= out")
-    stored = reader(path, *[given[key] if key != "axes" or reader is read_zarr else axes or "xyz" for key in takes])
-    stored.world_from_grid = replaced_grid(stored.world_from_grid, spacing_mm, origin_mm)
+    stored = replaced(reader(path, given), given)
     return to_volume(path, stored, nan_value)
 
 
@@ -117,7 +138,23 @@ def _three(path: Path, name: str, numbers: Any, *, positive: bool) -> np.ndarray
     return values
 
 
-def _reader(path: Path, *, raw: bool) -> tuple[Callable[..., Stored], tuple[str, ...]]:
+def _direction(path: Path, matrix: Any) -> np.ndarray | None:
+    """Unit vectors of the grid's axes, in the columns of a 3x3 matrix."""
+    if matrix is None:
+        return None
+    try:
+        values = np.asarray(matrix, float)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    regular = values.shape == (3, 3) and np.isfinite(values).all() and abs(np.linalg.det(values)) > 1e-6
+    if not regular or not np.allclose(np.linalg.norm(values, axis=0), 1, atol=1e-3):
+        raise VolumeError(
+            path, "direction= must be 3x3 numbers: in its columns unit vectors of the axes x, y, z, none in the plane of others"
+        )
+    return values
+
+
+def _reader(path: Path, *, raw: bool) -> tuple[Callable[[Path, Given], Stored], tuple[str, ...]]:
     """The reader for a name, and the keywords it takes."""
     name = path.name.lower()
     ending = next((ending for ending in (".nii.gz", path.suffix.lower()) if name.endswith(ending) and ending in READERS), None)

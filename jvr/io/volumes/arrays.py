@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 
 from jvr.io.volumes.errors import VolumeError, check_size, first_bytes, mislabelled, missing_extra, one_line, three_axes
+from jvr.io.volumes.given import Given
 from jvr.io.volumes.stored import Stored, affine_of
-
-MILLIMETRES = {"nanometer": 1e-6, "nm": 1e-6, "micrometer": 1e-3, "micron": 1e-3, "um": 1e-3, "µm": 1e-3, "\\u00b5m": 1e-3}
-MILLIMETRES |= {"millimeter": 1.0, "mm": 1.0, "centimeter": 10.0, "cm": 10.0, "inch": 25.4, "meter": 1000.0, "m": 1000.0}
+from jvr.io.volumes.units import MILLIMETRES
 
 
-def read_raw(path: Path, shape: Any, dtype: Any) -> Stored:
+def read_raw(path: Path, given: Given) -> Stored:
     """Voxels and nothing else, x fastest. `dtype` may state a byte order, as in ">i2"."""
     first_bytes(path)
+    shape, dtype = given.shape, given.dtype
     if shape is None or dtype is None:
         problem = "headerless data: give shape=(x, y, z) and dtype= such as 'uint8' or '>i2', and spacing= in mm"
         raise VolumeError(path, problem)
@@ -35,8 +35,8 @@ def read_raw(path: Path, shape: Any, dtype: Any) -> Stored:
     return Stored(np.memmap(path, dtype, "r", shape=three_axes(path, shape), order="F"))
 
 
-def read_npy(path: Path, axes: str) -> Stored:
-    """A NumPy array file, never unpickled. `axes` names the order of its axes."""
+def read_npy(path: Path, given: Given) -> Stored:
+    """A NumPy array file, never unpickled. `axes` of the caller names the order of its axes."""
     start = first_bytes(path)
     if not start.startswith(b"\x93NUMPY"):
         raise mislabelled(path, start, "a NumPy array file (.npy)")
@@ -52,7 +52,7 @@ def read_npy(path: Path, axes: str) -> Stored:
         values = np.load(path, mmap_mode="r", allow_pickle=False)
     except ValueError as error:
         raise VolumeError(path, f"cut short or damaged: {one_line(error)}; save it again") from None
-    return Stored(in_xyz(path, values, axes))
+    return Stored(in_xyz(path, values, given.axes or "xyz"))
 
 
 def _npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype]:
@@ -82,10 +82,10 @@ def in_xyz(path: Path, values: Any, axes: str) -> Any:
     return values.reshape(shape).transpose([axes.index(letter) for letter in wanted])
 
 
-def read_zarr(path: Path, array: str | None, axes: str | None) -> Stored:
-    """A Zarr array, or one in a group: `array` is its path there. Needs the extra `jvr[zarr]`.
+def read_zarr(path: Path, given: Given) -> Stored:
+    """A Zarr array, or one in a group: the caller's `array` is its path there. Needs the extra `jvr[zarr]`.
 
-    Axes come from `axes`, or else from the array's dimension names or OME-Zarr's metadata (then with scale and
+    Axes come from the caller's `axes`, or else from the array's dimension names or OME-Zarr's metadata (then with scale and
     translation), or else are x, y, z.
     """
     try:
@@ -97,7 +97,7 @@ def read_zarr(path: Path, array: str | None, axes: str | None) -> Stored:
     except Exception as error:
         raise VolumeError(path, f"not a Zarr array or group, or damaged: {one_line(error)}") from None
     ome = _multiscale(node) if isinstance(node, zarr.Group) else {}
-    found: Any = _zarr_array(path, zarr, node, array or ome.get("path")) if isinstance(node, zarr.Group) else node
+    found: Any = _zarr_array(path, zarr, node, given.array or ome.get("path")) if isinstance(node, zarr.Group) else node
     names = ome.get("axes") or getattr(found.metadata, "dimension_names", None) or found.attrs.get("_ARRAY_DIMENSIONS")
     # Time and channels of length one say nothing about where a voxel lies.
     kept = [k for k, n in enumerate(found.shape) if names is None or n > 1 or str(names[k]).lower() in ("x", "y", "z")]
@@ -115,7 +115,7 @@ def read_zarr(path: Path, array: str | None, axes: str | None) -> Stored:
         raise VolumeError(path, f"a chunk of the array is damaged: {one_line(error)}") from None
     letters = "".join(str(names[k]).lower() for k in kept) if names is not None else "xyz"
     known = len(letters) == len(shape) and set(letters) <= set("xyz")
-    order = axes or (letters if known else "xyz")
+    order = given.axes or (letters if known else "xyz")
     return Stored(in_xyz(path, values, order), _ome_affine(ome, kept, order) if ome else np.eye(4))
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from jvr.io.volumes.errors import VolumeError, check_size, first_bytes, grid_numbers, mislabelled, one_line
+from jvr.io.volumes.given import Given
 from jvr.io.volumes.itk import affine_of_image, check_pixels, silenced, voxels_of
 from jvr.io.volumes.stored import Stored
 
@@ -28,7 +29,7 @@ class _Slice:
     bytes_each: int
 
 
-def read_dicom_file(path: Path) -> Stored:
+def read_dicom_file(path: Path, given: Given) -> Stored:
     """One DICOM file: a single slice, or a multi-frame volume."""
     start = first_bytes(path)
     if start[128:132] != b"DICM":
@@ -36,8 +37,9 @@ def read_dicom_file(path: Path) -> Stored:
     return _read_series(path, [str(path)])
 
 
-def read_dicom_folder(folder: Path, series: str | None) -> Stored:
+def read_dicom_folder(folder: Path, given: Given) -> Stored:
     """The one series in a folder, or the one whose id is `series`."""
+    series = given.series
     import SimpleITK as sitk
 
     with silenced():

@@ -24,6 +24,7 @@ from jvr.io.volumes.errors import (
     one_line,
     three_axes,
 )
+from jvr.io.volumes.given import Given
 from jvr.io.volumes.stored import Stored, affine_of
 
 META_TYPES = {"CHAR": "i1", "UCHAR": "u1", "SHORT": "i2", "USHORT": "u2", "INT": "i4", "UINT": "u4", "LONG": "i4", "ULONG": "u4"}
@@ -93,7 +94,7 @@ def affine_of_image(image: Any) -> np.ndarray:
     return affine_of(spacing, origin, direction)
 
 
-def read_metaimage(path: Path) -> Stored:
+def read_metaimage(path: Path, given: Given) -> Stored:
     """A MetaImage, header and voxels in one file (.mha) or two (.mhd). ITK ignores its intensity function; kept here."""
     start = first_bytes(path)
     end = re.search(rb"^\s*ElementDataFile\s*=.*$\n?", start, re.MULTILINE)
@@ -181,7 +182,7 @@ def _unpacked(path: Path, file: Path, offset: int, announced: int) -> np.ndarray
     return buffer
 
 
-def read_nrrd(path: Path) -> Stored:
+def read_nrrd(path: Path, given: Given) -> Stored:
     """A NRRD, with its voxels attached (.nrrd) or in files of their own (.nhdr)."""
     start = first_bytes(path)
     if not start.startswith(b"NRRD"):

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from jvr.io.volumes.errors import VolumeError, check_size, first_bytes, grid_numbers, mislabelled, one_line, three_axes
+from jvr.io.volumes.given import Given
 from jvr.io.volumes.itk import affine_of_image, silenced
 from jvr.io.volumes.stored import Stored
 
@@ -34,7 +35,7 @@ class _Header:
     units: int
 
 
-def read_nifti(path: Path) -> Stored:
+def read_nifti(path: Path, given: Given) -> Stored:
     """A NIfTI-1 or NIfTI-2 file, plain or gzipped. Integers stay as stored, their slope and intercept beside them."""
     start = first_bytes(path, 1024)
     zipped = path.name.lower().endswith(".gz")

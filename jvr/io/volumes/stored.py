@@ -9,17 +9,23 @@ import jax
 import numpy as np
 
 from jvr.io.volumes.errors import VolumeError, three_axes
+from jvr.io.volumes.given import Given
 from jvr.model.volume import Volume
 
 
 @dataclasses.dataclass
 class Stored:
-    """Voxels `[x, y, z]`, where voxel (0, 0, 0) and its neighbours lie, and the slope and intercept of the file."""
+    """Voxels `[x, y, z]`, where voxel (0, 0, 0) and its neighbours lie, and the slope and intercept of the file.
+
+    `missing`: the stored number by which the file marks voxels without data; `unit`: of the data, such as "HU", where the file says so.
+    """
 
     values: np.ndarray
     world_from_grid: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))
     slope: float = 1.0
     intercept: float = 0.0
+    missing: float | None = None
+    unit: str = ""
     # Whose memory `values` looks into: a view of a SimpleITK image does not keep the image alive.
     owner: Any = None
 
@@ -32,14 +38,19 @@ def affine_of(spacing: Any, origin: Any = (0, 0, 0), direction: Any = None) -> n
     return matrix
 
 
-def replaced_grid(matrix: np.ndarray, spacing: np.ndarray | None, origin: np.ndarray | None) -> np.ndarray:
-    """The affine with the lengths of its axes, or the position of its first voxel, replaced."""
-    matrix = matrix.copy()
-    if spacing is not None:
-        matrix[:3, :3] *= spacing / np.linalg.norm(matrix[:3, :3], axis=0)
-    if origin is not None:
-        matrix[:3, 3] = origin
-    return matrix
+def replaced(stored: Stored, given: Given) -> Stored:
+    """What a reader found, with the lengths and directions of its axes, the position of its first voxel, slope and intercept replaced."""
+    matrix = stored.world_from_grid.copy()
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    if given.direction is not None:
+        matrix[:3, :3] = given.direction * lengths
+    if given.spacing is not None:
+        matrix[:3, :3] *= given.spacing / lengths
+    if given.origin is not None:
+        matrix[:3, 3] = given.origin
+    slope = stored.slope if given.slope is None else given.slope
+    intercept = stored.intercept if given.intercept is None else given.intercept
+    return dataclasses.replace(stored, world_from_grid=matrix, slope=slope, intercept=intercept)
 
 
 def to_volume(path: Path, stored: Stored, nan_value: float | int | None) -> Volume:

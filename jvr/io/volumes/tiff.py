@@ -6,9 +6,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from jvr.io.volumes.arrays import MILLIMETRES
 from jvr.io.volumes.errors import VolumeError, check_size, first_bytes, grid_numbers, mislabelled, one_line
+from jvr.io.volumes.given import Given
 from jvr.io.volumes.stored import Stored, affine_of
+from jvr.io.volumes.units import MILLIMETRES
 
 MAGIC = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 COMPRESSION_NONE, COMPRESSION_DEFLATE = 1, (8, 32946)
@@ -29,7 +30,7 @@ def _recorded():
         logger.propagate = propagate
 
 
-def read_tiff(path: Path) -> Stored:
+def read_tiff(path: Path, given: Given) -> Stored:
     """A stack of equal grey pages; one page is a volume one voxel thick."""
     import tifffile
 

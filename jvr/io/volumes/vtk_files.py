@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from jvr.io.volumes.errors import VolumeError, check_size, first_bytes, grid_numbers, grid_shape, mislabelled, missing_extra
+from jvr.io.volumes.given import Given
 from jvr.io.volumes.itk import read_image, silenced
 from jvr.io.volumes.stored import Stored, affine_of
 
@@ -28,9 +29,9 @@ class _Legacy:
     data_offset: int
 
 
-def read_legacy_vtk(path: Path, array: str | None) -> Stored:
+def read_legacy_vtk(path: Path, given: Given) -> Stored:
     """A legacy VTK file of structured points; `array` names one where a file holds several."""
-    start = first_bytes(path)
+    start, array = first_bytes(path), given.array
     if not start.startswith(b"# vtk DataFile"):
         raise mislabelled(path, start, "a legacy VTK file (its first line begins with '# vtk DataFile')")
     legacy = _legacy_header(path, start)
@@ -102,7 +103,7 @@ def _check_text(path: Path, offset: int, count: int) -> None:
         raise VolumeError(path, f"{problem}: the file is cut short or its DIMENSIONS are wrong")
 
 
-def read_vti(path: Path, array: str | None) -> Stored:
+def read_vti(path: Path, given: Given) -> Stored:
     """A VTK XML image, point or cell data; `array` names one where a file holds several. Needs the extra `jvr[vtk]`."""
     start = first_bytes(path)
     kind = re.search(rb"<VTKFile[^>]*\btype\s*=\s*[\"'](\w+)", start)
@@ -121,7 +122,7 @@ def read_vti(path: Path, array: str | None) -> Stored:
             path, f"WholeExtent is '{fields.get('WholeExtent', '')}'; it must be six numbers, first and last per axis"
         )
     check_size(path, [max(n - 1, 1) for n in points], 1, path.stat().st_size, compressed=True)
-    return _from_vtk(path, _vtk_reader(path, "vtkIOXML", "vtkXMLImageDataReader"), array)
+    return _from_vtk(path, _vtk_reader(path, "vtkIOXML", "vtkXMLImageDataReader"), given.array)
 
 
 def _vtk_reader(path: Path, module: str, name: str) -> Any:
