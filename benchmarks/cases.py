@@ -150,7 +150,7 @@ def fitting() -> dict[str, Any]:
     start, cameras, images, settings = protocol.start, protocol.cameras, protocol.images, protocol.settings
     chunk = sum(camera.width * camera.height for camera in cameras)
     observations = observe(start, cameras, images, None, settings, chunk)
-    kept = keep_samples(start, observations, settings, chunk, 2**31)
+    kept = keep_samples(start, observations, settings, chunk, 2**31, clamped=True)
     assert kept is not None
     through, rays = observed_medium(start, kept[1], kept[0], settings, seen_in_fit(start, settings, False))
     plain = jax.jit(yardsticks.kept_march)

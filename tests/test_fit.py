@@ -98,7 +98,7 @@ def test_kept_samples_change_nothing_and_report_their_bytes():
 
 def test_kept_samples_are_the_samples():
     problem, observations = _problem(), observe(START, CAMERAS, IMAGES, None, SETTINGS, 720)
-    samples, kept = keep_samples(START, observations, SETTINGS, 720, 2**30)
+    samples, kept = keep_samples(START, observations, SETTINGS, 720, 2**30, clamped=True)
     values = problem.unknowns.values_from_real(problem.unknowns.real_from_model(problem.model), problem.model)
     direct = normal_equations(problem, values, observations)
     stored = normal_equations(problem.with_samples(samples), values, kept)

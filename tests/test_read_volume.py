@@ -599,6 +599,39 @@ def test_voxels_that_are_not_finite_are_counted_or_replaced(tmp_path):
     wanted = np.where(np.isfinite(values), values, -7)
     assert_same(read_volume(tmp_path / "a.npy", nan_value=-7, spacing=SPACING, origin=ORIGIN), wanted)
     fails("nan_value=nan", tmp_path / "a.npy", nan_value=float("nan"))
+    np.save(tmp_path / "b.npy", np.where(np.isinf(values), np.nan, values))
+    with pytest.warns(UserWarning, match="3 of 105 voxels are NaN; they count as missing"):
+        volume = read_volume(tmp_path / "b.npy")
+    np.testing.assert_array_equal(np.asarray(volume.gaps) & 1 > 0, ~np.isfinite(values))
+
+
+@pytest.mark.parametrize(
+    ("kind", "number", "slope", "inter"),
+    [("i2", -2000, 1.0, 0.0), ("i2", -2000, 1.0, -1024.0), ("i2", -32768, 1.0, 0.0), ("f4", -3.4028235e38, 1.0, 0.0)],
+)
+def test_padding_is_found_and_said(tmp_path, kind, number, slope, inter):
+    code = {"i2": 4, "f4": 16}[kind]
+    values = voxels(kind)
+    values[:2] = number
+    (tmp_path / "a.nii").write_bytes(nifti(values, code=code, slope=slope, inter=inter))
+    with pytest.warns(UserWarning, match=r"30 of 105 voxels are .*far from all others, as padding is; .*missing=False"):
+        volume = read_volume(tmp_path / "a.nii")
+    np.testing.assert_array_equal(np.asarray(volume.gaps) & 1 > 0, values == number)
+    assert float(jnp.min(volume.values)) == values[values != number].min()
+    assert read_volume(tmp_path / "a.nii", missing=False).gaps is None
+
+
+def test_padding_is_what_the_caller_says_and_no_more(tmp_path):
+    values = voxels("i2")
+    (tmp_path / "a.nii").write_bytes(nifti(values, code=4, slope=2.0, inter=-10.0))
+    low = int(values.min())
+    volume = read_volume(tmp_path / "a.nii", missing=2.0 * low - 10)
+    np.testing.assert_array_equal(np.asarray(volume.gaps) & 1 > 0, values == low)
+    # Values that go on right beside a number are no padding.
+    values[0, 0, :2] = -2000, -1990
+    (tmp_path / "b.nii").write_bytes(nifti(values, code=4))
+    assert read_volume(tmp_path / "b.nii").gaps is None
+    fails("missing=nan", tmp_path / "b.nii", missing=float("nan"))
 
 
 def test_nan_value_is_in_data_units(tmp_path):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jvr.effects.cut import CutFaces
 from jvr.effects.own_shadow import Segment
 from jvr.effects.shading import share_of
-from jvr.march.shaders import OpticalShader, PreIntegratedShader
+from jvr.march.shaders import OpticalShader, PreIntegratedShader, where_known
 from jvr.march.steps import Point, Sample
 from jvr.model.by_value import at_value
 from jvr.model.effects import AbstractScattering, AbstractShading
@@ -99,7 +99,8 @@ class LitPreIntegratedShader(LitShader, PreIntegratedShader):
         factor, added = self.light_at(middle, point, transfer.evaluate(middle.s), dt)
         # A constant colour of the given optical depth.
         extra, _ = self.optical.segment(Classified(added, dtau), jnp.ones_like(dt))
-        return tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False)), dtau
+        look = tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False))
+        return where_known(samples, look), where_known(samples, dtau)
 
 
 def _mean(front: Sample, back: Sample) -> Sample:

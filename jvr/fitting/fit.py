@@ -254,7 +254,9 @@ def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool |
     if keep is False or moving or needs_gradient(problem.model.scene) or isinstance(problem.loss, DSSIM):
         return problem, observations
     limit = KEEP_LIMIT if keep is True else keep
-    kept = keep_samples(problem.model.scene, observations, problem.settings, chunk, limit)
+    ends = ("scene.transfer.positions", "scene.transfer.domain")
+    clamped = not any(name.startswith(ends) for name in problem.unknowns.names)
+    kept = keep_samples(problem.model.scene, observations, problem.settings, chunk, limit, clamped=clamped)
     if kept is None:
         return problem, observations
     return problem.with_samples(kept[0]), kept[1]

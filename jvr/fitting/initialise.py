@@ -15,15 +15,17 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable, LutTransfer
 from jvr.model.volume import Volume
+from jvr.model.voxels import typical_range
 from jvr.rendering.settings import Settings
 
 
 def flat_transfer(volume: Volume, entries: int = 64, *, opacity: float = 0.018, grey: float = 0.5) -> LutTransfer:
-    """A transfer function that says nothing yet: one grey, one thin extinction, over the range of the volume's values.
+    """A transfer function that says nothing yet: one grey, one thin extinction, over the range of the volume's values. Single voxels that
+    lie far beyond all others do not count, nor do missing ones; values beyond the table are those of its ends.
 
     **Arguments:** `entries`: of the table; `opacity`: optical depth of one voxel; `grey`: colour of every entry.
     """
-    ends = np.sort([float(volume.slope * v + volume.intercept) for v in (jnp.min(volume.values), jnp.max(volume.values))])
+    ends = np.sort([float(volume.slope * v + volume.intercept) for v in typical_range(volume.data())])
     if not ends[0] < ends[1]:
         raise ValueError(f"every voxel has the value {ends[0]:g}: a transfer function cannot be fitted to a constant volume")
     sigma_t = opacity / float(jnp.min(volume.spacing))

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jvr.march.fields import KeptField, VoxelField
+from jvr.march.fields import MISSING, KeptField, VoxelField
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
 from jvr.march.steps import Rays, points_at, segment, segment_count
 from jvr.model.camera import AbstractCamera
 from jvr.model.exact import Exact
 from jvr.model.scene import Scene
+from jvr.model.transfer import AbstractTable
 from jvr.numerics import two_sum
 from jvr.rendering.medium import medium, natural, occupancy, visibility
 from jvr.rendering.sampling import Uniform
@@ -54,12 +55,18 @@ class Observations(eqx.Module):
 
 
 class Samples(eqx.Module):
-    """Scalars along every ray, 16 bits each, in blocks of `stride` rays: sample `k` of a ray is at `start + k * stride`."""
+    """Scalars along every ray, 16 bits each, in blocks of `stride` rays: sample `k` of a ray is at `start + k * stride`. `gaps`: whether
+    some are missing."""
 
     stored: Any
     low: Float[Array, ""]
     scale: Float[Array, ""]
     stride: int = eqx.field(static=True)
+    gaps: bool = eqx.field(static=True)
+
+    def along(self, start: Int[Array, "rays"]) -> KeptField:
+        """The samples of rays as a field."""
+        return KeptField(self.stored, start, self.low, self.scale, self.stride, self.gaps)
 
     @property
     def bytes(self) -> int:
@@ -152,21 +159,20 @@ def thin(observations: Observations, every: int, chunk: int) -> Observations:
 
 
 def keep_samples(
-    scene: Scene, observations: Observations, settings: Settings, chunk: int, limit: int
+    scene: Scene, observations: Observations, settings: Settings, chunk: int, limit: int, *, clamped: bool
 ) -> tuple[Samples, Observations] | None:
     """Resamples the volume along every ray once, 16 bits a sample, or returns `None` where that would take more than `limit` bytes.
 
-    The error of a kept sample is at most 2^-17 of the range of the volume's values.
+    The error of a kept sample is at most 2^-17 of the range of the volume's values, of those between the ends of a table where these stay
+    (`clamped`).
     """
     pieces = observations.chunks(chunk)
     counts = [int(_longest(scene, piece, settings)) for piece in pieces]
     total = chunk * sum(counts)
     if 2 * total > limit or total >= 2**31:
         return None
-    low = scene.volume.slope * jnp.min(scene.volume.values) + scene.volume.intercept
-    high = scene.volume.slope * jnp.max(scene.volume.values) + scene.volume.intercept
-    low, high = jnp.minimum(low, high), jnp.maximum(low, high)
-    scale = jnp.where(high > low, (high - low) / 65535, 1.0)
+    low, high = _kept_range(scene, clamped)
+    scale = jnp.where(high > low, (high - low) / (MISSING - 1), 1.0)
     stored = np.empty(total, np.uint16)
     starts, begin = [], 0
     for piece, count in zip(pieces, counts, strict=True):
@@ -175,7 +181,18 @@ def keep_samples(
         starts.append(begin + np.arange(chunk, dtype=np.int32))
         begin += chunk * count
     kept = eqx.tree_at(lambda o: o.start, observations, jnp.asarray(np.concatenate(starts)))
-    return Samples(jnp.asarray(stored), low, scale, chunk), kept
+    return Samples(jnp.asarray(stored), low, scale, chunk, scene.volume.gaps is not None), kept
+
+
+def _kept_range(scene: Scene, clamped: bool) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Smallest and largest scalar to be told apart. Beyond the ends of a table, where scalars are `clamped` to them, all look alike: a hot
+    voxel takes no levels from the others."""
+    volume = scene.volume
+    ends = [volume.slope * v + volume.intercept for v in (jnp.min(volume.values), jnp.max(volume.values))]
+    low, high = jnp.minimum(*ends), jnp.maximum(*ends)
+    if clamped and isinstance(scene.transfer, AbstractTable):
+        low, high = (jnp.clip(end, *scene.transfer.ends) for end in (low, high))
+    return low, high
 
 
 def seen_in_fit(scene: Scene, settings: Settings, leaps: bool, visible: AbstractVisibility | None = None) -> Seen:
@@ -199,7 +216,7 @@ def observed_medium(
     rays = _inside(scene, piece)
     through = medium(near_volume(scene)[0], settings, *seen)
     if samples is not None:
-        through = through._replace(field=KeptField(samples.stored, piece.start, samples.low, samples.scale, samples.stride))
+        through = through._replace(field=samples.along(piece.start))
     return through, rays
 
 
@@ -214,8 +231,11 @@ def _resample(scene: Scene, piece: Observations, settings: Settings, k: Int[Arra
     rays = _inside(scene, piece)
     dt = step_length(scene, settings)
     _, u = segment(k, segment_count(rays.length, dt), rays.length, dt)
-    s = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u)).s
-    return jnp.clip(jnp.round((s - low) / scale), 0, 65535).astype(jnp.uint16)
+    found = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
+    level = jnp.clip(jnp.round((found.s - low) / scale), 0, MISSING - 1)
+    for known in found.known:
+        level = jnp.where(known > 0.5, level, MISSING)
+    return level.astype(jnp.uint16)
 
 
 def _check_weights(cameras: Sequence[AbstractCamera], weights: Sequence[Any] | None, dtype: Any) -> list[np.ndarray]:

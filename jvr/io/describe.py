@@ -19,8 +19,8 @@ WORDS = {"L": "left", "R": "right", "P": "posterior", "A": "anterior", "S": "sup
 def describe(volume: Volume, path: str | os.PathLike | None = None) -> dict[str, Any]:
     """Shape, type, place in the world and distribution of values of a volume, as plain numbers, strings and lists.
 
-    Lengths are millimetres; values are in data units (slope and intercept applied) and of finite voxels only, the others
-    are counted in `not_finite`. `orientation` names where the axes i, j, k of the grid point, in LPS: "LPS" is the
+    Lengths are millimetres; values are in data units (slope and intercept applied) and of voxels that hold data only, the
+    others are counted in `missing`. `orientation` names where the axes i, j, k of the grid point, in LPS: "LPS" is the
     identity, "RAS" points to the right, anterior and superior; `oblique_degrees` is the largest angle between an axis of the
     grid and the axis of the world that names it. `histogram` has 32 equal bins between the smallest and the largest value
     (`counts`) and their 33 `edges`. Percentiles of more than 2^24 voxels are those of an even subset. `mean`, `minimum`,
@@ -45,7 +45,8 @@ def describe(volume: Volume, path: str | os.PathLike | None = None) -> dict[str,
         "oblique_degrees": round(degrees, 2),
         "slope": float(volume.slope),
         "intercept": float(volume.intercept),
-        **_distribution(values, float(volume.slope), float(volume.intercept)),
+        "missing": int(values.size - _data(volume).size),
+        **_distribution(_data(volume), float(volume.slope), float(volume.intercept)),
     }
 
 
@@ -64,15 +65,17 @@ def _rounded(numbers: np.ndarray) -> list[float]:
     return [float(f"{x:.7g}") for x in numbers]
 
 
-def _distribution(values: np.ndarray, slope: float, intercept: float) -> dict[str, Any]:
-    finite = values.reshape(-1)
-    if values.dtype.kind == "f" and not np.isfinite(values).all():
-        finite = finite[np.isfinite(finite)]
-    not_finite = int(values.size - finite.size)
+def _data(volume: Volume) -> np.ndarray:
+    """Voxels that hold data, as they are stored."""
+    values = volume.data()
+    return values if values.dtype.kind in "iu" or np.isfinite(values).all() else values[np.isfinite(values)]
+
+
+def _distribution(finite: np.ndarray, slope: float, intercept: float) -> dict[str, Any]:
     if finite.size == 0:
         empty = {"counts": [], "edges": []}
         nothing = {"minimum": None, "maximum": None, "mean": None}
-        return {**nothing, "percentiles": {}, "histogram": empty, "not_finite": not_finite}
+        return {**nothing, "percentiles": {}, "histogram": empty}
     low, high = float(finite.min()), float(finite.max())
     subset = finite[:: -(-finite.size // MOST_SORTED)]
     quantiles = np.percentile(subset, PERCENTILES if slope > 0 else [100 - p for p in PERCENTILES]).astype(float)
@@ -87,7 +90,6 @@ def _distribution(values: np.ndarray, slope: float, intercept: float) -> dict[st
             "counts": [int(n) for n in (counts if slope > 0 else counts[::-1])],
             "edges": sorted(slope * float(edge) + intercept for edge in edges),
         },
-        "not_finite": not_finite,
     }
 
 
@@ -117,7 +119,7 @@ def format_description(description: dict[str, Any]) -> str:
         ("origin", f"{triple('origin', ', ')} mm"),
         ("orientation", f"{d['orientation']} (i, j, k to {towards}){tilted}"),
         *([("rescaling", f"{d['slope']:g} * voxel + {d['intercept']:g}")] if (d["slope"], d["intercept"]) != (1, 0) else []),
-        *([("not finite", f"{d['not_finite']:,} voxels")] if d["not_finite"] else []),
+        *([("missing", f"{d['missing']:,} voxels ({100 * d['missing'] / np.prod(d['shape']):.3g} %)")] if d["missing"] else []),
     ]
     if d["mean"] is not None:
         rows.append(("values", f"{d['minimum']:g} ... {d['maximum']:g}, mean {d['mean']:g}"))

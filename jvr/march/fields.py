@@ -11,6 +11,9 @@ from jvr.model.normals import AbstractNormals
 from jvr.model.volume import Volume
 from jvr.types import Scalar
 
+# Stands for a kept sample that is made of missing voxels.
+MISSING = 65535
+
 
 class VoxelField(AbstractField):
     """The voxels of a volume, interpolated between, with the gradient that `normals` makes of them where it is not `None`."""
@@ -19,9 +22,10 @@ class VoxelField(AbstractField):
     normals: AbstractNormals | None = None
 
     def resample(self, point: Point) -> Sample:
-        if self.normals is None:
-            return Sample(self.volume.sample(point.p))
-        return Sample(*self.normals.resample(self.volume, point.p))
+        volume, p = self.volume, point.p
+        s, gradient, neighbours = (volume.sample(p), (), ()) if self.normals is None else self.normals.resample(volume, p)
+        known = () if volume.gaps is None else (volume.is_known(p).astype(s.dtype),)
+        return Sample(s, gradient, neighbours, known=known)
 
     def deposit(self, gradient: Any, points: Point, cotangent: Sample) -> Any:
         if self.normals is None:
@@ -31,18 +35,22 @@ class VoxelField(AbstractField):
 
 class KeptField(AbstractField):
     """Scalars kept from an earlier march along the same rays: sample `k` of a ray is `stored[start[ray] + k * stride]`, an integer
-    that stands for `low + scale * stored`. Positions play no part, and nothing here is differentiable."""
+    that stands for `low + scale * stored`, or with `gaps` for a missing one where it is `MISSING`. Positions play no part, and nothing here
+    is differentiable."""
 
     stored: UInt[Array, "samples"]
     start: Int[Array, "rays"]
     low: Scalar
     scale: Scalar
     stride: int = eqx.field(static=True)
+    gaps: bool = eqx.field(static=True)
 
     def resample(self, point: Point) -> Sample:
         # Clipped: the index of a finished ray may lie beyond the end.
         index = self.start[point.ray] + point.segment * self.stride
-        return Sample(self.low + self.scale * self.stored.at[index].get(mode="clip").astype(self.low.dtype))
+        stored = self.stored.at[index].get(mode="clip")
+        known = ((stored != MISSING).astype(self.low.dtype),) if self.gaps else ()
+        return Sample(self.low + self.scale * stored.astype(self.low.dtype), known=known)
 
     def deposit(self, gradient: Any, points: Point, cotangent: Sample) -> Any:
         return gradient

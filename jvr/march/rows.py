@@ -22,6 +22,7 @@ from jvr.march.batch import pooled_while
 from jvr.march.march import Marched, MarchOptions, integrate
 from jvr.march.medium import Medium, for_derivatives
 from jvr.march.segments import Stretch, lanes_of, light_at, shown
+from jvr.march.shaders import where_known
 from jvr.march.steps import Rays, points_at, segment
 from jvr.march.sums import transmittance
 from jvr.model.transfer import AbstractTable, Classified
@@ -121,6 +122,7 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, of_extinctions: bo
         (of_entry,) = pull(((zero,) * len(emitted), _only(nothing.tau, c)))
         tau_sigma.append(of_entry.sigma_t[c])
     weights = TableRows(tuple(radiance_rgb), tuple(radiance_sigma) * of_extinctions, tuple(tau_sigma))
+    weights = jax.tree.map(lambda w: where_known((samples,), (w,))[0], weights)
     assert isinstance(medium.transfer, AbstractTable)
     u = jax.vmap(medium.transfer.coordinate)(samples.s)
     return (step_back(behind, front, emitted, dtau, distance), j + (j < back.steps)), (u, weights)

@@ -19,6 +19,13 @@ from jvr.types import Channels, Scalar
 ROUNDINGS = 4
 
 
+def where_known(samples: tuple[Sample, ...], channels: Channels) -> Channels:
+    """Channels that belong to some samples, zero where one of them is missing: where there are no data there is nothing to see."""
+    for known in (known for sample in samples for known in sample.known):
+        channels = tuple(jnp.where(known > 0.5, c, 0.0) for c in channels)
+    return channels
+
+
 class GradientFrame(eqx.Module):
     """Takes what the field resampled to a gradient in the world: `axes_inverse` and `intercept` are those of the volume, `shape` its
     voxels. What is no more than rounding leaves of equal scalars is zero."""
@@ -58,9 +65,11 @@ class OpticalShader(AbstractShader):
         return sample if self.frame is None else self.frame.in_world(transfer, sample, point)
 
     def classify(self, transfer: Any, sample: Sample) -> Classified:
-        if not transfer.takes_gradient:
-            return transfer.evaluate(sample.s)
-        return transfer.evaluate(sample.s, direction_and_length(sample.gradient)[1])
+        if transfer.takes_gradient:
+            found = transfer.evaluate(sample.s, direction_and_length(sample.gradient)[1])
+        else:
+            found = transfer.evaluate(sample.s)
+        return Classified(found.rgb, where_known((sample,), found.sigma_t))
 
 
 class LightPathShader(OpticalShader):
@@ -80,4 +89,5 @@ class PreIntegratedShader(OpticalShader):
 
     def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
-        return transfer.segment(self.optical, front.s, back.s, dt)
+        emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
+        return where_known(samples, emitted), where_known(samples, dtau)

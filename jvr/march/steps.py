@@ -41,13 +41,15 @@ class Sample(NamedTuple):
     """What is known at a point; parts that nobody asks for are empty.
 
     `s`: the scalar; `gradient`: its derivatives along the grid axes, or those of the extinction; `neighbours`: what else a gradient is made
-    of, such as scalars around the point before the transfer function; `light`: for each light, the transmittance between it and the point.
+    of, such as scalars around the point before the transfer function; `light`: for each light, the transmittance between it and the point;
+    `known`: 1, or 0 where voxels that it would be made of are missing, in volumes with gaps.
     """
 
     s: Float[Array, "..."]
     gradient: Triple = ()
     neighbours: Channels = ()
     light: tuple[Channels, ...] = ()
+    known: Channels = ()
 
 
 def segment_count(length: Float[Array, "rays"], dt: Scalar) -> Int[Array, "rays"]:

@@ -2,19 +2,21 @@
 
 import abc
 import functools
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder
 from jvr.model.kept import is_made_of, note_sources
 from jvr.model.packing import Squares, squares_of
+from jvr.model.voxels import CELL, VOXEL, in_memory, typical_range, without_gaps
 from jvr.numerics import add_runs, read_at, read_run, transformed, turned
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
 
@@ -29,13 +31,18 @@ class Run(NamedTuple):
 class AbstractInterpolation(eqx.Module):
     """How a value between voxels is made of the voxels around it."""
 
+    # Which bit of `Volume.gaps` says that a voxel of a stencil is missing.
+    gap: ClassVar[int]
+
     @abc.abstractmethod
     def stencil(self, shape: tuple[int, int, int], p: Triple) -> tuple[Run, ...]:
-        """The voxels that make the value at grid position `p`; their weights sum to one."""
+        """The voxels that make the value at grid position `p`; their weights sum to one. The first is the first of its cell."""
 
 
 class Trilinear(AbstractInterpolation):
     """Trilinear interpolation of the eight voxels around a point; continuous, differentiable in position inside each cell."""
+
+    gap: ClassVar[int] = CELL
 
     def stencil(self, shape: tuple[int, int, int], p: Triple) -> tuple[Run, ...]:
         (i, wx), (j, wy), (k, wz) = (_linear(x, n) for x, n in zip(p, shape, strict=True))
@@ -49,6 +56,8 @@ class Trilinear(AbstractInterpolation):
 
 class Nearest(AbstractInterpolation):
     """The value of the nearest voxel: for labels. Its derivative with respect to position is zero."""
+
+    gap: ClassVar[int] = VOXEL
 
     def stencil(self, shape: tuple[int, int, int], p: Triple) -> tuple[Run, ...]:
         i, j, k = (jnp.clip(jnp.round(x), 0, n - 1).astype(jnp.int32) for x, n in zip(p, shape, strict=True))
@@ -72,18 +81,23 @@ class Volume(eqx.Module):
 
     **Arguments:**
 
-    - `values`: shape `(x, y, z)`, floating point (differentiable) or integer (kept as it is in memory, not differentiable).
+    - `values`: shape `(x, y, z)`, floating point (differentiable) or integer (kept as it is in memory, not differentiable); what NumPy
+      holds, too: any byte order, truth values, integers of 64 bits as narrow as they fit.
     - `world_from_grid`: 4x4 affine, default the identity.
     - `slope`, `intercept`: scalars, default 1 and 0, as DICOM's rescale.
     - `interpolation`: `Trilinear()` (default) or `Nearest()`.
+    - `missing`: the stored number that means "no data", such as -2000; NaN voxels mean that by themselves. A sample that is made of such a
+      voxel is empty, and neither the range of values nor gradients know of it: `values` holds what lies around in its place.
     - `remainder`: of a `world_from_grid` that JAX holds already: what single precision leaves of one that was given in double precision
       (see `jvr.model.exact`). Positions of cameras, lights and clipping boxes are taken relative to the volume before they are rounded.
 
     `bricks`, `squares` and `gradients` are `None` until `bricked()`, `packed()` and `graded()` make them. What has been replaced since is
-    never seen in their place: `current()` makes them anew where they are not known to belong to the voxels.
+    never seen in their place: `current()` makes them anew where they are not known to belong to the voxels. `gaps` says which voxels are
+    missing (bit 0; bit 1: which cells of eight have one that is), `None` where none is; voxels that are replaced keep it.
 
-    **Raises** `ValueError` for another number of dimensions, an empty array or a singular transform, `TypeError` for voxels
-    that are not real numbers. Everything but `interpolation` is an array and differentiable.
+    **Raises** `ValueError` for another number of dimensions, an empty array, infinite or only missing voxels, integers beyond 32 bits, a
+    singular transform, a slope of zero, a slope or intercept that is not finite, `TypeError` for voxels that are not real numbers. Warns
+    where single precision loses what sets voxels apart. Everything but `interpolation` is an array and differentiable.
     """
 
     values: Voxels
@@ -94,6 +108,7 @@ class Volume(eqx.Module):
     bricks: Bricks | None
     squares: Squares | None
     gradients: Float[Array, "x y z 3"] | None
+    gaps: UInt8[Array, "x y z"] | None
     remainder: Remainder
 
     def __init__(
@@ -104,9 +119,10 @@ class Volume(eqx.Module):
         slope: ArrayLike = 1.0,
         intercept: ArrayLike = 0.0,
         interpolation: AbstractInterpolation = Trilinear(),
+        missing: float | int | None = None,
         remainder: Remainder | None = None,
     ):
-        values = jnp.asarray(values)
+        values = in_memory(values)
         if values.ndim != 3 or values.size == 0:
             raise ValueError(f"a volume needs three non-empty axes (x, y, z); its voxels have shape {values.shape}")
         if values.size >= 2**31:
@@ -115,12 +131,18 @@ class Volume(eqx.Module):
             )
         if not (jnp.issubdtype(values.dtype, jnp.floating) or jnp.issubdtype(values.dtype, jnp.integer)):
             raise TypeError(f"voxels must be real or integer numbers, not {values.dtype}")
-        self.values = values
+        self.values, self.gaps = without_gaps(values, missing)
+        if jnp.issubdtype(values.dtype, jnp.floating):
+            require(
+                self.values, lambda v: ~np.isinf(v), "voxels must not be infinite: replace them, by NaN where there are no data"
+            )
         world_from_grid = jnp.eye(4) if world_from_grid is None else world_from_grid
         self.world_from_grid = affine(world_from_grid, "world_from_grid")
         self.remainder = Remainder.left(world_from_grid, self.world_from_grid, remainder)
         self.slope = float_array(slope, "slope", ())
         self.intercept = float_array(intercept, "intercept", ())
+        require(self.slope, lambda x: np.isfinite(x) & (x != 0), f"slope must be finite and not 0, not {slope}")
+        require(self.intercept, np.isfinite, f"intercept must be finite, not {intercept}")
         self.interpolation = interpolation
         self.bricks = None
         self.squares = None
@@ -140,8 +162,9 @@ class Volume(eqx.Module):
     def packed(self) -> "Volume":
         """The same volume with its voxels packed for interpolation as well: faster pictures and fits, for 4 more bytes a voxel.
 
-        `uint8` voxels are kept as they are. Others are rounded to 256 levels between the smallest and the largest of them, an error of
-        at most 1/510 of that range, and are no longer differentiable; `slope` and `intercept` make up for it, so that `s` means the same.
+        `uint8` voxels are kept as they are. Others are rounded to 256 levels of their range, an error of at most 1/510 of it, and are no
+        longer differentiable; `slope` and `intercept` make up for it, so that `s` means the same. Single voxels that lie far beyond all
+        others, which would leave few levels for these, become the nearest level.
         **Raises** `ValueError` unless interpolation is trilinear.
         """
         if not isinstance(self.interpolation, Trilinear):
@@ -245,6 +268,17 @@ class Volume(eqx.Module):
             value += sum(w * run[i].astype(w.dtype) for i, w in enumerate(weights))
         return value
 
+    def data(self) -> np.ndarray:
+        """The stored voxels that hold data, `(n,)`, of arrays at hand."""
+        values = np.asarray(self.values).reshape(-1)
+        return values if self.gaps is None else values[np.asarray(self.gaps).reshape(-1) & VOXEL == 0]
+
+    def is_known(self, p: Triple) -> Bool[Array, ""]:
+        """Whether no voxel that makes the value at one grid position is missing; a volume without gaps has no use for it."""
+        assert self.gaps is not None
+        (start, _), *_ = self.interpolation.stencil(self.shape, p)
+        return read_at(self.gaps.reshape(-1), start) & self.interpolation.gap == 0
+
     def grid_from_world(self, x: Triple, *, direction: bool = False) -> Triple:
         """Grid position of a world position, or with `direction=True` grid displacement of a world displacement.
 
@@ -319,9 +353,10 @@ def _squares_if_other(values: Voxels, squares: Squares) -> Squares:
 def _quantised(volume: Volume) -> Volume:
     """The volume with `uint8` voxels."""
     values = jax.lax.stop_gradient(volume.values).astype(volume.slope.dtype)
-    low, high = jnp.min(values), jnp.max(values)
+    traced = isinstance(values, Tracer)
+    low, high = (jnp.min(values), jnp.max(values)) if traced else map(jnp.asarray, typical_range(volume.data()))
     scale = jnp.where(high > low, (high - low) / 255, 1.0)
-    levels = jnp.round((values - low) / scale).astype(jnp.uint8)
+    levels = jnp.clip(jnp.round((values - low) / scale), 0, 255).astype(jnp.uint8)
     slope, intercept = volume.slope * scale, volume.slope * low + volume.intercept
     return eqx.tree_at(lambda v: (v.values, v.slope, v.intercept), volume, (levels, slope, intercept))
 

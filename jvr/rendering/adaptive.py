@@ -79,6 +79,8 @@ def render_slices(
 
 def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
     """The transfer function; says what cannot be rendered, rather than leaving it out."""
+    if scene.volume.gaps is not None:
+        raise ValueError(f"jvr.Slices() interpolates between samples, of which some are missing in this volume: {UNIFORM}")
     if not isinstance(scene.volume.interpolation, Trilinear):
         name = type(scene.volume.interpolation).__name__
         raise ValueError(f"jvr.Slices() interpolates between samples, which {name}() volumes do not allow: {UNIFORM}")

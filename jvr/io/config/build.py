@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,13 +82,16 @@ def build_volume(config: Config) -> Volume:
     table = config.tables.volume
     volume = _builtin() if table.path is None else _read(config, table, table.path)
     interpolation = INTERPOLATIONS[table.interpolation]()
-    values, slope, intercept = volume.values, volume.slope, volume.intercept
+    volume = eqx.tree_at(lambda v: v.interpolation, volume, interpolation)
     if table.scale is not None:
         low, high = table.scale
-        scaled = (np.asarray(values, np.float64) * float(slope) + float(intercept) - low) / (high - low)
-        values, slope, intercept = np.clip(scaled, 0, 1).astype(np.float32), 1.0, 0.0
-    placed = {"world_from_grid": volume.world_from_grid, "remainder": volume.remainder}
-    volume = Volume(values, slope=slope, intercept=intercept, interpolation=interpolation, **placed)
+        scaled = (np.asarray(volume.values, np.float64) * float(volume.slope) + float(volume.intercept) - low) / (high - low)
+        parts = (
+            jnp.asarray(np.clip(scaled, 0, 1).astype(np.float32)),
+            jnp.ones_like(volume.slope),
+            jnp.zeros_like(volume.intercept),
+        )
+        volume = eqx.tree_at(lambda v: (v.values, v.slope, v.intercept), volume, parts)
     with blame(config.name, "volume.packed"):
         return volume.packed() if table.packed else volume
 

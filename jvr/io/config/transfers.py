@@ -28,6 +28,7 @@ from jvr.model import presets
 from jvr.model.gradient_transfer import GradientOpacity, GradientTransfer
 from jvr.model.transfer import AbstractTransfer, GaussianTransfer, LinearTransfer, LutTransfer
 from jvr.model.volume import Volume
+from jvr.model.voxels import typical_range
 
 HEADER = "# A transfer function of jvr: colours are linear RGB, extinction is per world length (mm).\n"
 FIELDS = {
@@ -157,8 +158,11 @@ def _contents(volume: Volume) -> tuple[float, float]:
     """From where the surroundings end (Otsu's threshold) to the brightest voxels but a few."""
     from skimage.filters import threshold_otsu
 
-    every = max(volume.values.size // 2**20, 1)
-    values = np.asarray(volume.values).reshape(-1)[::every].astype(np.float64) * float(volume.slope) + float(volume.intercept)
+    data = volume.data()
+    values = data[:: max(data.size // 2**20, 1)].astype(np.float64) * float(volume.slope) + float(volume.intercept)
+    ends = np.sort([float(volume.slope * v + volume.intercept) for v in typical_range(data)])
+    # A hot voxel would take Otsu's bins from all others.
+    values = np.clip(values, *ends)
     if values.min() == values.max():
         raise ValueError(f"every voxel has the value {values.min():g}: there is nothing to see")
     low, high = float(threshold_otsu(values)), float(np.percentile(values, 99.9))

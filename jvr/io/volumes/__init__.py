@@ -68,8 +68,9 @@ def read_volume(
     channel: int | str | None = None,
     time: int | None = None,
     direction: Sequence[Sequence[float]] | np.ndarray | None = None,
-    slope: float | None = None,
-    intercept: float | None = None,
+    slope: float | int | None = None,
+    intercept: float | int | None = None,
+    missing: float | int | bool | None = None,
     nan_value: float | int | None = None,
 ) -> Volume:
     """Reads a scalar volume and where it lies in the world (millimetres, LPS, as ITK reads it).
@@ -94,6 +95,9 @@ def read_volume(
     - `series`: which DICOM series of a folder, by its id.
     - `axes`: the order of a NumPy or Zarr array's axes, such as "zyx"; default "xyz", or what a Zarr's metadata say.
     - `channel`, `time`: which of several channels (its index from 0 or its name) and points in time (its index).
+    - `missing`: the number, in data units, that means "no data"; `False` where none does. Default: what the file says, or a number that
+      scanners and simulations write for it (-2000, -3024, -32768, -9999, ... or beyond 1e30) where it lies far from all others, with a
+      warning. NaN means that by itself. What is missing stays empty.
     - `nan_value`: number, in data units, that takes the place of NaN and infinite voxels.
 
     **Raises** `VolumeError` (a `ValueError`) with one line that names the file, what is wrong and what would be right, for
@@ -114,14 +118,20 @@ def read_volume(
         axes=axes,
         channel=channel,
         time=time,
+        missing=missing,
+        nan_value=nan_value,
     )
     if nan_value is not None and not math.isfinite(nan_value):
         raise VolumeError(path, f"nan_value={nan_value} must be a finite number")
+    if missing is True or (missing is not None and not math.isfinite(missing)):
+        raise VolumeError(
+            path, f"missing={missing} must be a finite number, or False for none; NaN voxels are missing by themselves"
+        )
     reader, takes = _reader(path, raw=shape is not None and dtype is not None)
     if superfluous := [key for key in MEANING if getattr(given, key) is not None and key not in takes]:
         raise VolumeError(path, f"{MEANING[superfluous[0]]}: leave {superfluous[0]}= out")
     stored = replaced(reader(path, given), given)
-    return to_volume(path, stored, nan_value)
+    return to_volume(path, stored, given)
 
 
 def _three(path: Path, name: str, numbers: Any, *, positive: bool) -> np.ndarray | None:

@@ -20,10 +20,12 @@ class Given:
     spacing: np.ndarray | None = None
     origin: np.ndarray | None = None
     direction: np.ndarray | None = None
-    slope: float | None = None
-    intercept: float | None = None
+    slope: float | int | None = None
+    intercept: float | int | None = None
     array: str | None = None
     series: str | None = None
     axes: str | None = None
     channel: int | str | None = None
     time: int | None = None
+    missing: float | int | bool | None = None
+    nan_value: float | int | None = None

@@ -5,12 +5,13 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from jvr.io.volumes.errors import VolumeError, three_axes
 from jvr.io.volumes.given import Given
+from jvr.io.volumes.missing import missing_number
 from jvr.model.volume import Volume
+from jvr.model.voxels import integer_type
 
 
 @dataclasses.dataclass
@@ -53,71 +54,62 @@ def replaced(stored: Stored, given: Given) -> Stored:
     return dataclasses.replace(stored, world_from_grid=matrix, slope=slope, intercept=intercept)
 
 
-def to_volume(path: Path, stored: Stored, nan_value: float | int | None) -> Volume:
+def to_volume(path: Path, stored: Stored, given: Given) -> Volume:
     """The `Volume` of what a reader found; `nan_value`, in data units, takes the place of voxels that are not finite."""
     values = stored.values.reshape(three_axes(path, stored.values.shape))
     if not all(np.isfinite([stored.slope, stored.intercept])) or stored.slope == 0:
-        raise VolumeError(path, f"slope {stored.slope} and intercept {stored.intercept} must be finite, the slope not 0")
-    dtype = _memory_type(path, values)
+        problem = f"slope {stored.slope} and intercept {stored.intercept} must be finite, the slope not 0"
+        raise VolumeError(path, f"{problem}; slope= and intercept= replace them")
     # One copy, which also owns its memory: JAX may share an array's memory instead of copying it.
-    with np.errstate(over="ignore"):
-        kept = np.array(values, dtype=dtype, order="C")
-    if np.issubdtype(dtype, np.floating):
-        _replace_non_finite(path, values, kept, None if nan_value is None else (nan_value - stored.intercept) / stored.slope)
-        _warn_of_lost_detail(path, values, kept)
+    kept = np.array(values, dtype=_memory_type(path, values), order="C")
+    if kept.dtype.kind == "f":
+        _replace_non_finite(path, kept, None if given.nan_value is None else _stored(stored, given.nan_value))
+    missing = missing_number(path, stored, kept, given)
     try:
-        return Volume(kept, stored.world_from_grid, slope=stored.slope, intercept=stored.intercept)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            volume = Volume(kept, stored.world_from_grid, slope=stored.slope, intercept=stored.intercept, missing=missing)
+    except ValueError as error:
+        raise VolumeError(path, f"{error}") from None
+    for warning in caught:
+        warnings.warn(f"{path}: {warning.message}", stacklevel=3)
+    return volume
+
+
+def _stored(stored: Stored, number: float | int) -> float:
+    """A number in data units as it is stored."""
+    return (number - stored.intercept) / stored.slope
+
+
+def _memory_type(path: Path, values: np.ndarray) -> np.dtype:
+    """The type that voxels are handed on in: integers as narrow as they fit, floats as they are."""
+    kind = values.dtype.kind
+    if kind == "b":
+        return np.dtype(np.uint8)
+    if kind not in "iuf":
+        kinds = {"c": "complex numbers", "O": "Python objects", "V": "records of several fields"}
+        problem = f"the voxels are {kinds.get(kind, 'not numbers')} ({values.dtype}); save them as real numbers"
+        raise VolumeError(path, problem + (", their magnitude for example" if kind == "c" else ""))
+    try:
+        return integer_type(values)
     except ValueError as error:
         raise VolumeError(path, f"{error}") from None
 
 
-def _memory_type(path: Path, values: np.ndarray) -> np.dtype:
-    """The type that voxels get in memory: integers stay integers, wide ones as narrow as they fit; floats become float32."""
-    kind = values.dtype.kind
-    if kind == "b":
-        return np.dtype(np.uint8)
-    if kind == "f":
-        return np.dtype(np.float64 if _x64() and values.dtype.itemsize >= 8 else np.float32)
-    if kind not in "iu":
-        kinds = {"c": "complex numbers", "O": "Python objects", "V": "records of several fields"}
-        problem = f"the voxels are {kinds.get(kind, 'not numbers')} ({values.dtype}); save them as real numbers"
-        raise VolumeError(path, problem + (", their magnitude for example" if kind == "c" else ""))
-    if values.dtype.itemsize <= 2:
-        return values.dtype.newbyteorder("=")
-    low, high = int(values.min()), int(values.max())
-    types = [np.uint8, np.int8, np.int16, np.uint16, np.int32, np.uint32, *([np.int64, np.uint64] if _x64() else [])]
-    for dtype in types:
-        if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max:
-            return np.dtype(dtype)
-    raise VolumeError(path, f"integers from {low} to {high} do not fit 32 bits; rescale them or enable x64 in JAX")
-
-
-def _x64() -> bool:
-    return jax.dtypes.canonicalize_dtype(np.float64) == np.float64
-
-
-def _replace_non_finite(path: Path, found: np.ndarray, kept: np.ndarray, replacement: float | None) -> None:
-    """Writes `replacement` over NaN and infinity in `kept`, or raises where there is none."""
+def _replace_non_finite(path: Path, kept: np.ndarray, replacement: float | None) -> None:
+    """Writes `replacement` over NaN and infinity; without one NaN stays, which means that there are no data."""
     bad = ~np.isfinite(kept)
     count = int(bad.sum())
     if count == 0:
         return
-    too_large = count - int((~np.isfinite(found)).sum())
-    if too_large:
-        raise VolumeError(path, f"{too_large:,} voxels exceed the range of float32 (3.4e38); rescale them or enable x64 in JAX")
-    if replacement is None:
-        nans = int(np.isnan(kept).sum())
+    nans = int(np.isnan(kept).sum())
+    if replacement is not None:
+        kept[bad] = replacement
+    elif nans < count:
         problem = f"{count:,} of {kept.size:,} voxels are not finite ({nans:,} NaN, {count - nans:,} infinite)"
         raise VolumeError(path, f"{problem}; nan_value=0 (--nan-value 0), or another number, replaces them")
-    kept[bad] = replacement
-
-
-def _warn_of_lost_detail(path: Path, found: np.ndarray, kept: np.ndarray) -> None:
-    """float64 voxels with a large offset (1e9 + something small) lose in float32 what sets them apart."""
-    if found.dtype.itemsize <= kept.dtype.itemsize:
-        return
-    low, high = float(kept.min()), float(kept.max())
-    finest = float(np.finfo(np.float32).eps) * max(abs(low), abs(high))
-    if finest > 1e-3 * (high - low) and not np.array_equal(found, kept, equal_nan=True):
-        message = f"{path}: float32 resolves only {finest:.2g} in values from {low:.9g} to {high:.9g}"
-        warnings.warn(f"{message}; subtract the offset or enable x64 in JAX", stacklevel=4)
+    elif nans == kept.size:
+        raise VolumeError(path, "every voxel is NaN: there are no data; export it again, or nan_value=0 (--nan-value 0)")
+    else:
+        problem = f"{nans:,} of {kept.size:,} voxels are NaN; they count as missing and stay empty"
+        warnings.warn(f"{path}: {problem}: nan_value=0 (--nan-value 0) gives them a value", stacklevel=4)
