@@ -45,6 +45,7 @@ def describe(volume: Volume, path: str | os.PathLike | None = None) -> dict[str,
         "oblique_degrees": round(degrees, 2),
         "slope": float(volume.slope),
         "intercept": float(volume.intercept),
+        "unit": volume.unit,
         "missing": int(values.size - _data(volume).size),
         **_distribution(_data(volume), float(volume.slope), float(volume.intercept)),
     }
@@ -122,7 +123,7 @@ def format_description(description: dict[str, Any]) -> str:
         *([("missing", f"{d['missing']:,} voxels ({100 * d['missing'] / np.prod(d['shape']):.3g} %)")] if d["missing"] else []),
     ]
     if d["mean"] is not None:
-        rows.append(("values", f"{d['minimum']:g} ... {d['maximum']:g}, mean {d['mean']:g}"))
+        rows.append(("values", f"{d['minimum']:g} ... {d['maximum']:g} {d['unit']}".rstrip() + f", mean {d['mean']:g}"))
         rows.append(("percentiles", "   ".join(f"{p} %: {value:g}" for p, value in d["percentiles"].items())))
     lines = [f"{name:<13}{text}" for name, text in rows]
     return "\n".join(lines + _chart(d["histogram"]))

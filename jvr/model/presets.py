@@ -1,11 +1,14 @@
-"""First pictures of one's own scan: a ramp by window and level, and presets for CT in Hounsfield units.
+"""First pictures of one's own scan: a ramp by window and level, presets for CT in Hounsfield units, for scans whose values have no unit,
+and for labels.
 
 Extinctions are per millimetre, the unit of the world in every medical format.
 """
 
+import colorsys
+
 import numpy as np
 
-from jvr.model.transfer import LinearTransfer
+from jvr.model.transfer import LinearTransfer, LutTransfer
 from jvr.types import ArrayLike
 
 
@@ -21,6 +24,23 @@ def window_level(
         raise ValueError(f"window must be positive, not {window}")
     top = np.asarray(rgb, dtype=float)
     return LinearTransfer([level - window / 2, level + window / 2], [top / 2, top], [0.0, sigma_t])
+
+
+def ct() -> LinearTransfer:
+    """Bone in ivory, muscle and organs in translucent red, a veil of skin and fat; HU, per millimetre."""
+    return _points(
+        [
+            (-200, 0.80, 0.50, 0.40, 0.0),
+            (-120, 0.85, 0.60, 0.45, 0.003),
+            (-40, 0.85, 0.55, 0.40, 0.003),
+            (10, 0.60, 0.12, 0.09, 0.006),
+            (60, 0.62, 0.13, 0.10, 0.03),
+            (130, 0.75, 0.25, 0.18, 0.05),
+            (190, 0.95, 0.82, 0.65, 0.18),
+            (350, 0.98, 0.93, 0.82, 0.6),
+            (1500, 1.0, 1.0, 0.97, 1.2),
+        ]
+    )
 
 
 def ct_bone() -> LinearTransfer:
@@ -68,6 +88,47 @@ def ct_vessels() -> LinearTransfer:
             (1200, 1.0, 1.0, 1.0, 0.7),
         ]
     )
+
+
+WARM = [[0.35, 0.10, 0.06], [0.70, 0.30, 0.18], [0.90, 0.60, 0.38], [0.97, 0.85, 0.65], [1.0, 1.0, 0.95]]
+IVORY = [[0.45, 0.40, 0.35], [0.80, 0.75, 0.66], [0.95, 0.92, 0.85], [1.0, 0.99, 0.95]]
+
+
+def scan(low: float | int, high: float | int, *, sigma_t: float | int) -> LinearTransfer:
+    """Layers from a red veil to solid white, for values without a unit.
+
+    **Arguments:** `low`, `high`: where there begins to be something to see, and the brightest, in the data's units, here and below;
+    `sigma_t`: extinction at `high`, per world length.
+    """
+    return _layers(low, high, [0.0, 0.25, 0.5, 0.75, 1.0], WARM, np.array([0.0, 0.08, 0.25, 0.6, 1.0]) * sigma_t)
+
+
+def mr(low: float | int, high: float | int, *, sigma_t: float | int) -> LinearTransfer:
+    """Tissue that is solid from its surface on, as MR shows it."""
+    return _layers(low, high, [0.0, 0.15, 0.4, 0.7, 1.0], WARM, np.array([0.0, 0.15, 0.6, 1.0, 1.0]) * sigma_t)
+
+
+def micro_ct(low: float | int, high: float | int, *, sigma_t: float | int) -> LinearTransfer:
+    """One solid material in ivory, such as bone, rock or foam, in nothing that is to be seen."""
+    return _layers(low, high, [0.1, 0.3, 0.6, 1.0], IVORY, np.array([0.0, 0.7, 1.0, 1.0]) * sigma_t)
+
+
+def labels(count: int, *, sigma_t: float | int) -> LutTransfer:
+    """A colour for each of the labels 1 ... `count`, label 0 transparent; neighbours differ in hue by the golden ratio."""
+    if not count >= 1:
+        raise ValueError(f"there must be at least one label, not {count}")
+    hues = [colorsys.hsv_to_rgb(i * 0.618034 % 1, 0.55 + 0.125 * (7 * i % 3), 0.95) for i in range(count + 1)]
+    extinction = np.full(count + 1, float(sigma_t))
+    extinction[0] = 0.0
+    return LutTransfer(np.square(hues), extinction, [0, count])
+
+
+def _layers(
+    low: float | int, high: float | int, places: list[float], rgb: list[list[float]], sigma_t: np.ndarray
+) -> LinearTransfer:
+    if not low < high:
+        raise ValueError(f"a preset needs low < high, not {low:g} and {high:g}")
+    return LinearTransfer(low + (high - low) * np.asarray(places), rgb, sigma_t)
 
 
 def _points(rows: list[tuple[float | int, ...]]) -> LinearTransfer:

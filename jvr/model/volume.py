@@ -88,6 +88,7 @@ class Volume(eqx.Module):
     - `interpolation`: `Trilinear()` (default) or `Nearest()`.
     - `missing`: the stored number that means "no data", such as -2000; NaN voxels mean that by themselves. A sample that is made of such a
       voxel is empty, and neither the range of values nor gradients know of it: `values` holds what lies around in its place.
+    - `unit`: of the data, such as "HU", where that is known; only said.
     - `remainder`: of a `world_from_grid` that JAX holds already: what single precision leaves of one that was given in double precision
       (see `jvr.model.exact`). Positions of cameras, lights and clipping boxes are taken relative to the volume before they are rounded.
 
@@ -110,6 +111,7 @@ class Volume(eqx.Module):
     gradients: Float[Array, "x y z 3"] | None
     gaps: UInt8[Array, "x y z"] | None
     remainder: Remainder
+    unit: str = eqx.field(static=True)
 
     def __init__(
         self,
@@ -120,6 +122,7 @@ class Volume(eqx.Module):
         intercept: ArrayLike = 0.0,
         interpolation: AbstractInterpolation = Trilinear(),
         missing: float | int | None = None,
+        unit: str = "",
         remainder: Remainder | None = None,
     ):
         values = in_memory(values)
@@ -144,6 +147,7 @@ class Volume(eqx.Module):
         require(self.slope, lambda x: np.isfinite(x) & (x != 0), f"slope must be finite and not 0, not {slope}")
         require(self.intercept, np.isfinite, f"intercept must be finite, not {intercept}")
         self.interpolation = interpolation
+        self.unit = unit
         self.bricks = None
         self.squares = None
         self.gradients = None

@@ -107,13 +107,15 @@ def build_scene(config: Config, volume: Volume | None = None) -> Scene:
     return _scene(config, volume, _start(config, volume))
 
 
-def build_cameras(config: Config, volume: Volume) -> tuple[AbstractCamera, ...]:
-    """All cameras of `[camera]`, in order."""
+def build_cameras(config: Config, volume: Volume, transfer: AbstractTransfer | None = None) -> tuple[AbstractCamera, ...]:
+    """All cameras of `[camera]`, in order; `transfer`: what `frame = "visible"` goes by."""
+    if transfer is None and any(table.frame == "visible" for table in config.tables.camera):
+        transfer = build_scene(config, volume).transfer
     cameras: list[AbstractCamera] = []
     for i, table in enumerate(config.tables.camera):
         key = f"camera[{i}]" if len(config.tables.camera) > 1 else "camera"
         with blame(config.where(key), key):
-            cameras.extend(cameras_of(table, volume))
+            cameras.extend(cameras_of(table, volume, transfer))
     return tuple(cameras)
 
 

@@ -2,26 +2,47 @@
 
 import itertools
 
+import jax.numpy as jnp
 import numpy as np
 
 from jvr.io.config.schema.whole import AnyCamera, OrthographicTable, PerspectiveTable, RigTable
+from jvr.march.occupancy import occupancy_of
+from jvr.model.bricks import bricks_of
 from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, fibonacci_sphere, orbit
 from jvr.model.exact import in_double
+from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
+from jvr.model.voxels import VOXEL
 
-# From the front of a patient (-y in LPS), a little from above and from the left.
-AUTOMATIC_DIRECTION = np.array([0.45, -1.0, 0.35])
-# How much larger than the box of the volume a picture is.
+# From where each view looks at a patient in LPS: by default from the front, a little from above and from the left.
+VIEWS = {
+    "oblique": [0.45, -1.0, 0.35],
+    "front": [0.0, -1.0, 0.0],
+    "back": [0.0, 1.0, 0.0],
+    "left": [1.0, 0.0, 0.0],
+    "right": [-1.0, 0.0, 0.0],
+    "top": [0.0, 0.0, 1.0],
+    "bottom": [0.0, 0.0, -1.0],
+}
+# How much larger than what it shows a picture is.
 MARGIN = 1.05
 
 
-def cameras_of(table: AnyCamera, volume: Volume) -> tuple[AbstractCamera, ...]:
-    """The cameras of one table; what it leaves out comes from the box of the volume."""
+def cameras_of(table: AnyCamera, volume: Volume, transfer: AbstractTransfer | None = None) -> tuple[AbstractCamera, ...]:
+    """The cameras of one table; what it leaves out comes from the box of the volume, or from what `transfer` leaves visible of it."""
     corners = _corners(volume)
-    center = np.mean(corners, axis=0) if table.target is None else np.asarray(table.target, float)
+    if table.frame == "visible" and transfer is not None:
+        seen = _visible_corners(volume, transfer)
+        corners = seen if len(seen) else corners
+    center = (corners.min(axis=0) + corners.max(axis=0)) / 2 if table.target is None else np.asarray(table.target, float)
     if isinstance(table, RigTable):
-        return _rig(table, center, float(volume.radius))
+        return _rig(table, center, float(np.max(np.linalg.norm(corners - center, axis=1))))
     right, up, back = _pose(table, center)
+    if table.target is None and table.eye is None:
+        # What is seen need not lie evenly about the middle of its box.
+        for axis in (right, up):
+            ends = (corners - center) @ axis
+            center = center + axis * (ends.min() + ends.max()) / 2
     corners = corners - center
     x, y, depth = np.abs(corners @ right), np.abs(corners @ up), corners @ back
     aspect = table.width / table.height
@@ -43,13 +64,36 @@ def _corners(volume: Volume) -> np.ndarray:
     return grid @ matrix[:3, :3].T + matrix[:3, 3]
 
 
+def _visible_corners(volume: Volume, transfer: AbstractTransfer) -> np.ndarray:
+    """World positions of the corners of all visible bricks, `(n, 3)`."""
+    bricks = volume.bricks if volume.bricks is not None else volume.bricked().bricks
+    assert bricks is not None
+    reach = np.asarray(occupancy_of(bricks, volume.slope, volume.intercept, transfer).reach)
+    if volume.gaps is not None:
+        reach = np.where(_without_data(volume, bricks.size), 1, reach)
+    first = np.argwhere(reach == 0)[:, None] * bricks.size
+    grid = first + np.array(list(itertools.product((0, bricks.size), repeat=3)))
+    low, high = volume.domain
+    grid = np.unique(np.clip(grid.reshape(-1, 3), low, high), axis=0)
+    matrix = in_double(volume.world_from_grid, volume.remainder)
+    return grid @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _without_data(volume: Volume, size: int) -> np.ndarray:
+    """Which bricks hold missing voxels alone."""
+    present = np.asarray(volume.gaps) & VOXEL == 0
+    return np.asarray(bricks_of(jnp.asarray(present.astype(np.uint8)), size).upper) == 0
+
+
 def _pose(table: PerspectiveTable | OrthographicTable, center: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Axes of the camera: right, up and back. z is up unless the view is along it."""
-    back = AUTOMATIC_DIRECTION if table.eye is None else np.asarray(table.eye) - center
+    back = np.asarray(VIEWS[table.view or "oblique"]) if table.eye is None else np.asarray(table.eye) - center
     if np.allclose(back, 0):
         raise ValueError("eye and target are the same point: move one of them")
     back = back / np.linalg.norm(back)
-    upward = np.eye(3)[2 if abs(back[2]) < 0.999 else 1] if table.up is None else np.asarray(table.up)
+    # Seen from above or below, the front of a patient is up.
+    along_z = [0.0, 1.0, 0.0] if table.view is None else [0.0, -1.0, 0.0]
+    upward = np.asarray(table.up if table.up is not None else [0.0, 0.0, 1.0] if abs(back[2]) < 0.999 else along_z)
     right = np.cross(upward, back)
     if not np.linalg.norm(right) > 1e-6 * np.linalg.norm(upward):
         raise ValueError("up must not be zero or parallel to the view: choose another")

@@ -39,6 +39,8 @@ FIELDS = {
 }
 # Optical depth of an automatic window's brightest value, from the centre of the volume to its farthest corner.
 AUTOMATIC_DEPTH = 30.0
+# Optical depth of one voxel of a label: its front hides what is behind.
+LABEL_DEPTH = 8.0
 
 
 def write_transfer(path: str | os.PathLike, transfer: AbstractTransfer) -> None:
@@ -104,9 +106,22 @@ def _of_scalar(table: OfScalar, volume: Volume | None) -> AbstractTransfer:
         case SampledTable():
             return _sampled(table)
         case PresetTable():
-            return getattr(presets, table.preset)()
+            return _preset(table, volume)
         case WindowTable():
             return _window(table, volume)
+
+
+def _preset(table: PresetTable, volume: Volume | None) -> AbstractTransfer:
+    preset = getattr(presets, table.preset)
+    if table.preset.startswith("ct"):
+        return preset()
+    if volume is None:
+        raise ValueError(f"preset {table.preset} looks at the volume: in a file of its own, a table of numbers is needed")
+    if table.preset == "labels":
+        spacing = float(np.min(np.asarray(volume.spacing)))
+        return preset(int(volume.data().max()), sigma_t=LABEL_DEPTH / spacing if table.sigma_t is None else table.sigma_t)
+    low, high = contents(volume) if table.range is None else table.range
+    return preset(low, high, sigma_t=AUTOMATIC_DEPTH / float(volume.radius) if table.sigma_t is None else table.sigma_t)
 
 
 def _toml(array: np.ndarray) -> str:
@@ -148,13 +163,13 @@ def _window(table: WindowTable, volume: Volume | None) -> LinearTransfer:
     top = AUTOMATIC_DEPTH / float(volume.radius) if table.sigma_t is None and volume is not None else table.sigma_t or 0.0
     if table.window is not None and table.level is not None:
         return presets.window_level(table.window, table.level, sigma_t=top, rgb=table.rgb)
-    low, high = _contents(volume) if volume is not None else (0.0, 1.0)
+    low, high = contents(volume) if volume is not None else (0.0, 1.0)
     # Darker and fainter below than a ramp would be: what surrounds the brightest parts must not hide them.
     rgb = np.outer([0.1, 0.4, 1.0], table.rgb)
     return LinearTransfer([low, 0.5 * (low + high), high], rgb, np.array([0.0, 0.1, 1.0]) * top)
 
 
-def _contents(volume: Volume) -> tuple[float, float]:
+def contents(volume: Volume) -> tuple[float, float]:
     """From where the surroundings end (Otsu's threshold) to the brightest voxels but a few."""
     from skimage.filters import threshold_otsu
 

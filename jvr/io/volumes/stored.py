@@ -68,7 +68,9 @@ def to_volume(path: Path, stored: Stored, given: Given) -> Volume:
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            volume = Volume(kept, stored.world_from_grid, slope=stored.slope, intercept=stored.intercept, missing=missing)
+            volume = Volume(
+                kept, stored.world_from_grid, slope=stored.slope, intercept=stored.intercept, missing=missing, unit=stored.unit
+            )
     except ValueError as error:
         raise VolumeError(path, f"{error}") from None
     for warning in caught:

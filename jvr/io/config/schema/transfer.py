@@ -119,11 +119,25 @@ class GradientTable(Table):
         return self
 
 
+# Presets that take their range from the volume.
+RELATIVE = ("scan", "mr", "micro_ct")
+
+
 class PresetTable(OfScalarTable):
-    """One of `jvr.presets`, for CT in Hounsfield units."""
+    """One of `jvr.presets`: for CT in Hounsfield units, or for values whose range is given, or found in the volume."""
 
     kind: Literal["preset"]
-    preset: Literal["ct_bone", "ct_soft_tissue", "ct_lung", "ct_vessels"]
+    preset: Literal["ct", "ct_bone", "ct_soft_tissue", "ct_lung", "ct_vessels", "scan", "mr", "micro_ct", "labels"]
+    range: Range | None = None
+    sigma_t: Extinction | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "PresetTable":
+        if self.range is not None and self.preset not in RELATIVE:
+            raise problem(f"belongs to {', '.join(RELATIVE)}; {self.preset} has its own", "range")
+        if self.sigma_t is not None and self.preset.startswith("ct"):
+            raise problem(f"{self.preset} has its own", "sigma_t")
+        return self
 
 
 class WindowTable(OfScalarTable):

@@ -44,28 +44,43 @@ class ClippingTable(Table):
 
 
 class CameraTable(Table):
-    """What all cameras share."""
+    """What all cameras share. `frame`: what a camera whose place is left out shows whole: the box of the volume, or what the transfer
+    function leaves visible of it."""
 
+    frame: Literal["box", "visible"] = "box"
     target: Position | None = None
     width: Pixels = 512
     height: Pixels = 512
 
 
-class PerspectiveTable(CameraTable):
+View = Literal["oblique", "front", "back", "left", "right", "top", "bottom"]
+
+
+class SingleTable(CameraTable):
+    """One camera: where it is, or from which side of the patient (x to the left, y to the back, z up) it looks at all there is."""
+
+    eye: Position | None = None
+    view: View | None = None
+    up: Position | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "SingleTable":
+        if self.eye is not None and self.view is not None:
+            raise problem("excludes eye: give one of the two", "view")
+        return self
+
+
+class PerspectiveTable(SingleTable):
     """`jvr.PerspectiveCamera`; without `eye`, a view from the front, above and to the side that shows the whole volume."""
 
     kind: Literal["perspective"]
-    eye: Position | None = None
-    up: Position | None = None
     fov_y: Angle = 30.0
 
 
-class OrthographicTable(CameraTable):
+class OrthographicTable(SingleTable):
     """`jvr.OrthographicCamera`."""
 
     kind: Literal["orthographic"]
-    eye: Position | None = None
-    up: Position | None = None
     height_world: Length | None = None
 
 
