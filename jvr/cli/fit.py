@@ -71,7 +71,7 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
 
 
 def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float, beforehand: Beforehand) -> dict[str, Any]:
-    from jvr.io.images import replacing
+    from jvr.atomic import replacing
 
     fitted = _pictures(result.scene, result.exposure, job.cameras, job)
     for i, (target, found) in enumerate(zip(job.targets, fitted, strict=True)):
@@ -106,7 +106,7 @@ def _pictures(scene: Any, exposure: float, cameras: Any, job: FitJob) -> list[np
 
 
 def _write_views(folder: Path, name: str, target: np.ndarray, fitted: np.ndarray) -> None:
-    from jvr.io.images import write_image
+    from jvr.pictures import write_image
 
     for kind, image in (("target", target), ("fitted", fitted), ("difference", fitted - target)):
         write_image(folder / f"{kind}_{name}.exr", image)

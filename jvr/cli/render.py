@@ -25,7 +25,7 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
     import jax
 
     from jvr.cli.runtime import compiling
-    from jvr.io.images import write_image
+    from jvr.pictures import write_image
     from jvr.rendering.image import render
 
     pictures, outputs, compile_seconds = [], _names(output, len(cameras)), 0.0

@@ -1,8 +1,6 @@
 """Saving an unfinished fit so that it can go on to the same answer."""
 
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from jvr.atomic import replacing
 
 
 class CheckpointError(ValueError):
@@ -21,15 +21,9 @@ def save(path: Path, state: Any, history: list[dict[str, Any]], fingerprint: str
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(state, _is_data))]
     meta = json.dumps({"history": history, "fingerprint": fingerprint})
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            arrays: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
-            np.savez(file, meta=np.array(meta), **arrays)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    arrays: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, meta=np.array(meta), **arrays)
 
 
 def load(path: Path, like: Any, fingerprint: str) -> tuple[Any, list[dict[str, Any]]]:

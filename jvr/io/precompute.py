@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jvr.atomic import replacing
 from jvr.effects.radiance_transfer import MaterialBleeding, ProjectedTransfer
 from jvr.effects.transfer_grid import TransferProjection, finished, project_all, transfer_of
-from jvr.io.images import replacing
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
 from jvr.parallel import in_threads, workers
