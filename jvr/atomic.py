@@ -10,6 +10,7 @@ from pathlib import Path
 
 # Seconds after which nobody writes a file any more that has no name of its own yet.
 ABANDONED = 86_400.0
+_unfinished: set[Path] = set()
 
 
 @contextlib.contextmanager
@@ -28,6 +29,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     remove_parts(real.parent, real.name, older=ABANDONED)
     # Not tempfile: its files are for their owner's eyes only, and the name would keep that.
     temporary = real.with_name(f".{real.name[:80]}.{uuid.uuid4().hex[:8]}.part")
+    _unfinished.add(temporary)
     try:
         temporary.touch(exist_ok=False)
         yield temporary
@@ -38,6 +40,14 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         reason = error.strerror or " ".join(str(error).split())
         raise type(error)(f"{path}: cannot be written: {reason}; choose another name or folder, or make room") from error
     finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        _unfinished.discard(temporary)
+
+
+def remove_unfinished() -> None:
+    """Removes what `replacing` writes in this process now: for one that ends without unwinding."""
+    for temporary in tuple(_unfinished):
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
 

@@ -134,7 +134,8 @@ def _write_exr(path: Path, pixels: Pixels, alpha: Plane | None, depth: Plane | N
         try:
             OpenEXR.File({"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}, planes).write(str(temporary))
         except Exception as error:
-            raise OSError(" ".join(str(error).split())) from error
+            # The library names the temporary file; what counts comes after it.
+            raise OSError(" ".join(str(error).rsplit('".', 1)[-1].rstrip(".").split())) from error
 
 
 @contextlib.contextmanager

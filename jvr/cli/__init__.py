@@ -4,32 +4,24 @@ Nothing that takes time is imported before `run` can catch Ctrl-C.
 """
 
 import os
-import signal
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-# What a shell says of a command that a signal ended: 128 and its number.
-INTERRUPTED, TERMINATED, CLOSED_PIPE = 130, 143, 141
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM: what unwinds on Ctrl-C unwinds here, too."""
+from jvr.cli.signals import INTERRUPTED, Terminated, catch, leave, said
 
 
 def main() -> NoReturn:
     """The entry point of the `jvr` command."""
-    signal.signal(signal.SIGTERM, _terminate)
+    catch()
     try:
         status = run(sys.argv[1:])
-        sys.stdout.flush()
+        if sys.stdout is not None:  # closed by the caller
+            sys.stdout.flush()
     except OSError as error:
         status = _unprintable(error)
-    except KeyboardInterrupt as error:
-        status = _ended(error)
-    if status in (INTERRUPTED, TERMINATED):
-        # At once: the interpreter would wait for threads that compute what nobody wants any more.
-        os._exit(status)
+    if status > 128:
+        leave(status)
     sys.exit(status)
 
 
@@ -49,43 +41,28 @@ def run(arguments: Sequence[str]) -> int:
 
         try:
             status = app(list(arguments) or ["--help"], prog_name="jvr", standalone_mode=False)
+            if status == INTERRUPTED:  # typer's word for a KeyboardInterrupt
+                raise KeyboardInterrupt
             return status if isinstance(status, int) else 0
         except BadInput as error:
             return explain(str(error), 2)
         except Interrupted as error:
-            return explain(str(error), _status(error.__cause__))
-        except typer.Abort:
-            return explain("interrupted", INTERRUPTED)
+            return explain(str(error), error.status)
         except usage_error as error:
             return explain(usage_problem(error), 2)
-        except BrokenPipeError:
-            raise
         except OSError as error:
             return explain(system_problem(error), 1)
-    except KeyboardInterrupt as error:
-        return _ended(error)
-
-
-def _terminate(*_: Any) -> NoReturn:
-    raise Terminated
-
-
-def _status(error: BaseException | None) -> int:
-    return TERMINATED if isinstance(error, Terminated) else INTERRUPTED
-
-
-def _ended(error: KeyboardInterrupt) -> int:
-    status = _status(error)
-    print(f"jvr: {'terminated' if status == TERMINATED else 'interrupted'}", file=sys.stderr)
-    return status
+    except (KeyboardInterrupt, Terminated) as error:
+        status = error.status if isinstance(error, Terminated) else INTERRUPTED
+        print(f"jvr: {said(status)}", file=sys.stderr, flush=True)
+        return status
 
 
 def _unprintable(error: OSError) -> int:
     """The status where the output took no more; what is left of it goes nowhere, or the interpreter would try again."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if isinstance(error, BrokenPipeError):
-        return CLOSED_PIPE
-    print(f"jvr: stdout: {error.strerror}", file=sys.stderr)
+    if not isinstance(error, BrokenPipeError):
+        print(f"jvr: stdout: {error.strerror}", file=sys.stderr)
     return 1
 
 

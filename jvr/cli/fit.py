@@ -15,6 +15,7 @@ from jvr.cli.beforehand import Beforehand
 from jvr.cli.folder import CHECKPOINT, PAGE, RESULT, TRANSFER, alone_in, check_results, results_in
 from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by_jvr
 from jvr.cli.runtime import nested, plain, progress, provenance, use_compilation_cache
+from jvr.cli.signals import INTERRUPTED, Terminated, said
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
 
 
@@ -69,9 +70,10 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
         checkpoint.unlink(missing_ok=True)
     try:
         return fit(job.scene, job.cameras, job.targets, **keywords)
-    except KeyboardInterrupt as error:
+    except (KeyboardInterrupt, Terminated) as error:
         kept = f"{checkpoint} is kept, --resume goes on from it" if checkpoint.exists() else "no step was finished"
-        raise Interrupted(f"interrupted: {kept}") from error
+        status = error.status if isinstance(error, Terminated) else INTERRUPTED
+        raise Interrupted(f"{said(status)}: {kept}", status) from error
     except ValueError as error:
         if not refused_by_jvr(error):
             raise

@@ -22,7 +22,11 @@ class BadInput(Exception):
 
 
 class Interrupted(Exception):
-    """Ctrl-C; the message says what was kept."""
+    """Ctrl-C or SIGTERM; the message says what was kept."""
+
+    def __init__(self, message: str, status: int):
+        super().__init__(message)
+        self.status = status
 
 
 @contextlib.contextmanager
@@ -156,4 +160,6 @@ def _try_to_write(folder: Path, flag: str) -> None:
 
 def system_problem(error: OSError) -> str:
     """Jvr's own messages name the file already; the system's have it in an attribute."""
-    return f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
+    if error.strerror is None:
+        return str(error)
+    return f"{error.filename}: {error.strerror}" if error.filename else f"{error.strerror}: output is cut short"

@@ -34,6 +34,11 @@ def _factor(function: Any, real: Array) -> Array:
     return jnp.where(loss > 0, real.size / jnp.where(loss > 0, loss, 1.0), 1.0)
 
 
+@eqx.filter_jit
+def _value(function: Any, real: Array) -> Array:
+    return function(real, None)[0]
+
+
 class GradientState(NamedTuple):
     """`inner` is the other library's state; `best` and `best_loss` the best point it has accepted; `factor` that of `Scaled`."""
 
@@ -131,7 +136,10 @@ class LBFGSB(AbstractGradientSolver):
         bounds = _bounds(functions, real)
         real = jnp.clip(real, *bounds)
         factor = _factor(functions.value, real)
-        return _begin(real, _bounded_init(self.tol, self.history, Scaled(functions.value, factor), real, bounds), factor)
+        scaled = Scaled(functions.value, factor)
+        state = _begin(real, _bounded_init(self.tol, self.history, scaled, real, bounds), factor)
+        # Its first step may end at a worse point: the start counts as one that it has accepted.
+        return state._replace(best_loss=_value(scaled, real))
 
     def step(self, functions: Functions, state: GradientState) -> GradientState:
         scaled = Scaled(functions.value, state.factor)
