@@ -34,6 +34,7 @@ JVR = [sys.executable, "-c", "from jvr.cli import main; main()"]
 def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("JVR_CACHE", "0")
+    monkeypatch.setenv("PYTHONPATH", str(Path(jvr.__file__).parents[1]))
     (tmp_path / "fit.toml").write_text(FIT)
 
 
@@ -79,7 +80,7 @@ def test_an_output_never_changes_what_is_read(tmp_path, capfd):
     (tmp_path / "link.toml").symlink_to("fit.toml")
     with pytest.raises(BadInput, match="slices, which is read"):
         check_inputs_stay(Path("slices/new.png"), [Path("slices")])
-    with pytest.raises(BadInput, match="fit.toml, which is read"):
+    with pytest.raises(BadInput, match=r"fit\.toml, which is read"):
         check_inputs_stay(Path("link.toml"), [Path("fit.toml")])
     check_inputs_stay(Path("slices/new.exr"), [Path("slices"), Path("fit.toml")])
 
@@ -129,12 +130,6 @@ def test_force_replaces_all_results_of_the_other_fit(tmp_path, capfd):
     assert json.loads((tmp_path / "out" / "result.json").read_text())["command"] == "fit"
     modes = {stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "out").iterdir()}
     assert len(modes) == 1
-    # Where the truth is where the fit starts, all pictures are exact.
-    exact = ["fit.unknowns=['background']", "background=[0.1,0.2,0.3]"]
-    assert cli.run(["fit", "fit.toml", "-o", "exact", "--set", exact[0], "--set", exact[1], "--set", "fit.start={}"][:-2]) in (
-        0,
-        2,
-    )
 
 
 # --- Whole or not at all ---------------------------------------------------------------------------------------------
@@ -155,7 +150,7 @@ def test_a_write_protected_picture_stays(tmp_path, monkeypatch):
     jvr.write_image("a.png", np.zeros((2, 2, 3)))
     before = Path("a.png").read_bytes()
     monkeypatch.setattr(os, "access", lambda *_: False)  # who runs this may be allowed to do everything
-    with pytest.raises(PermissionError, match="a.png: the file is write-protected; choose another name"):
+    with pytest.raises(PermissionError, match=r"a\.png: the file is write-protected; choose another name"):
         jvr.write_image("a.png", np.ones((2, 2, 3)))
     assert Path("a.png").read_bytes() == before
 
@@ -179,10 +174,10 @@ def test_a_full_disk_is_one_line(monkeypatch, capfd):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("typer.echo", full)
-    assert cli.run(["plan", "fit.toml"]) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr("typer.echo", full)
+        assert cli.run(["plan", "fit.toml"]) == 1
     assert capfd.readouterr().err == "jvr: No space left on device: output is cut short\n"
-    monkeypatch.undo()
     monkeypatch.setattr(os, "replace", full)
     for name in ("a.png", "a.exr"):
         with pytest.raises(OSError, match=f"{name}: cannot be written: No space left on device; choose another name"):
@@ -250,7 +245,8 @@ SOLVERS = {
 }
 
 
-@pytest.mark.parametrize("name", ["adam", *(pytest.param(n, marks=pytest.mark.slow) for n in SOLVERS if n != "adam")])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SOLVERS)
 def test_a_fit_goes_on_with_every_solver(tmp_path, name):
     """The solver is made anew, as by another process."""
     path = tmp_path / "fit.npz"
@@ -266,9 +262,8 @@ def test_a_fit_goes_on_with_every_solver(tmp_path, name):
             fit(solver=_adam(), settings=changed, max_steps=3, checkpoint=path, resume=True)
 
 
-@pytest.mark.parametrize(
-    "solver", [None, pytest.param(jvr.LBFGSB(), marks=pytest.mark.slow), pytest.param(_adam(), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [None, jvr.LBFGSB(), _adam()], ids=["levenberg-marquardt", "lbfgsb", "adam"])
 def test_pictures_that_are_exact_from_the_start_and_tiny_views_end_well(solver):
     flat = jvr.PerspectiveCamera(CAMERAS[0].world_from_camera, 30.0, 9, 2)
     result = jvr.fit(
@@ -282,7 +277,7 @@ def test_pictures_that_are_exact_from_the_start_and_tiny_views_end_well(solver):
         progress=False,
     )
     assert result.outcome is jvr.Outcome.CONVERGED
-    assert len(result.history) == 1
+    assert len(result.history) <= 2  # with a part of the rays, then with all
     np.testing.assert_allclose(result.scene.transfer.rgb, TRUTH.transfer.rgb, atol=1e-4)
     ((decibels, ssim),) = result.stats.held_out
     assert np.isfinite(decibels)
@@ -375,6 +370,23 @@ def test_a_rendering_shows_itself_in_a_notebook(tmp_path):
     assert shown.shape == (3, 4, 3)
     assert shown[1, 1].tolist() == [188, 188, 188]
     assert shown[0, 0].tolist() == [255, 0, 255]
+
+
+def test_objects_show_themselves_in_a_notebook():
+    shown = VOLUME._repr_html_()
+    assert shown.count("<img") == 3
+    assert "12 x 13 x 11" in shown
+    tables = np.ones((2, 2, 3)), np.ones((2, 2))
+    gradient = jvr.GradientTransfer(*tables, (0, 1), (0, 2))
+    for transfer in (TRUTH.transfer, jvr.GradientOpacity(TRUTH.transfer, 0, 1), gradient, jvr.presets.ct_bone()):
+        assert transfer._repr_html_().count("<img") == 1
+    assert "150 ... 1500" in jvr.presets.ct_bone()._repr_html_()
+    stats = jvr.fitting.fit.FitStats(1.0, 0, 0.01, 2, 3.0, (), ())
+    errors = (np.full((8, 3), np.inf), np.full(8, 0.25))
+    result = jvr.FitResult(TRUTH, (), errors, ("transfer.rgb", "transfer.sigma_t"), jvr.Outcome.CONVERGED, 1.0, stats)
+    assert "converged after 0 steps" in result._repr_html_()
+    assert "24 of 24 not determined" in result._repr_html_()
+    assert "standard error 0.25" in result._repr_html_()
 
 
 # --- The command itself ----------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -95,6 +96,17 @@ class FitResult(NamedTuple):
     def errors_by_name(self) -> dict[str, np.ndarray]:
         """The standard errors of each fitted array, by its path in the scene."""
         return dict(zip(self.unknowns, map(np.asarray, jax.tree.leaves(self.standard_errors)), strict=True))
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: how the fit ended, how sure its values are, and the transfer function."""
+        last = f", PSNR {self.history[-1].psnr:.1f} dB" if self.history else ""
+        lines = [f"Fit: {self.outcome.value} after {len(self.history)} steps, {self.stats.seconds:.1f} s{last}"]
+        lines += [f"held-out view: PSNR {psnr:.1f} dB, SSIM {ssim:.4f}" for psnr, ssim in self.stats.held_out]
+        for name, errors in self.errors_by_name.items():
+            known = errors[np.isfinite(errors)]
+            middle = f"standard error {np.median(known):.2g} (median), " if known.size else ""
+            lines.append(f"{name}: {middle}{errors.size - known.size} of {errors.size} not determined by the images")
+        return f"<div>{'<br>'.join(map(escape, lines))}{self.scene.transfer._repr_html_()}</div>"
 
 
 def fit(

@@ -41,6 +41,12 @@ class AbstractTransfer(eqx.Module):
         where entries lie.
         """
 
+    def _repr_html_(self) -> str:
+        """What notebooks show."""
+        from jvr.model.html import transfer_html
+
+        return transfer_html(self)
+
 
 class AbstractTable(AbstractTransfer):
     """A transfer function that interpolates the rows of a table linearly, colour and extinction separately."""
