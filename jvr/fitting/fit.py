@@ -4,6 +4,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,10 +23,11 @@ from jvr.fitting.objective import Problem, march_unknowns
 from jvr.fitting.observations import Observations, check_images, is_mostly_empty, keep_samples, observe
 from jvr.fitting.solvers import AbstractSolver
 from jvr.fitting.unknowns import Exposed, Unknowns, choose_unknowns
-from jvr.fitting.work import Work, fingerprint
+from jvr.fitting.work import Work
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import render
+from jvr.rendering.measure import similarity
 from jvr.rendering.medium import needs_gradient
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
@@ -95,6 +97,17 @@ class FitResult(NamedTuple):
         """The standard errors of each fitted array, by its path in the scene."""
         return dict(zip(self.unknowns, map(np.asarray, jax.tree.leaves(self.standard_errors)), strict=True))
 
+    def _repr_html_(self) -> str:
+        """What notebooks show: how the fit ended, how sure its values are, and the transfer function."""
+        last = f", PSNR {self.history[-1].psnr:.1f} dB" if self.history else ""
+        lines = [f"Fit: {self.outcome.value} after {len(self.history)} steps, {self.stats.seconds:.1f} s{last}"]
+        lines += [f"held-out view: PSNR {psnr:.1f} dB, SSIM {ssim:.4f}" for psnr, ssim in self.stats.held_out]
+        for name, errors in self.errors_by_name.items():
+            known = errors[np.isfinite(errors)]
+            middle = f"standard error {np.median(known):.2g} (median), " if known.size else ""
+            lines.append(f"{name}: {middle}{errors.size - known.size} of {errors.size} not determined by the images")
+        return f"<div>{'<br>'.join(map(escape, lines))}{self.scene.transfer._repr_html_()}</div>"
+
 
 def fit(
     scene: Scene,
@@ -163,7 +176,7 @@ def fit(
     observations = observe(scene, cameras, targets, weights, settings, chunk)
     problem, observations = _keep(problem, observations, chunk, keep_samples)
     work = Work(problem, observations, chunk, cameras, targets)
-    mark = fingerprint(problem, observations, solver) if checkpoint else ""
+    mark = checkpoints.fingerprint(problem, observations, solver) if checkpoint else {}
     state, history = solver.init(work.functions, chosen.real_from_model(model)), []
     if checkpoint and resume and Path(checkpoint).exists():
         state, rows = checkpoints.load(Path(checkpoint), state, mark)
@@ -282,17 +295,14 @@ def _compare(
     found: Exposed, settings: Settings, cameras: Sequence[AbstractCamera], images: Any
 ) -> tuple[tuple[float, float], ...]:
     """PSNR and SSIM of views that took no part in the fit."""
-    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+    from skimage.metrics import peak_signal_noise_ratio
 
     exposure = 1.0 if found.exposure is None else float(found.exposure)
     scores = []
     for camera, target in zip(cameras, check_images(cameras, images, "held-out image"), strict=True):
         rendered = exposure * np.asarray(render(found.scene, camera, settings).rgb)
         psnr = peak_signal_noise_ratio(target, rendered, data_range=1.0)
-        # An odd window that fits into the smallest picture.
-        window = min(7, (min(target.shape[:2]) - 1) // 2 * 2 + 1)
-        ssim: Any = structural_similarity(target, rendered, data_range=1.0, channel_axis=-1, win_size=window)
-        scores.append((float(psnr), float(ssim)))
+        scores.append((float(psnr), similarity(target, rendered)))
     return tuple(scores)
 
 

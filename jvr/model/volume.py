@@ -213,6 +213,12 @@ class Volume(eqx.Module):
             note_sources(squares.entries, self.values)
         return eqx.tree_at(lambda v: v.squares, volume, squares)
 
+    def _repr_html_(self) -> str:
+        """What notebooks show: the middle slices."""
+        from jvr.model.html import volume_html
+
+        return volume_html(self)
+
     @property
     def shape(self) -> tuple[int, int, int]:
         nx, ny, nz = self.values.shape
