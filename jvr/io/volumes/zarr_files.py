@@ -20,8 +20,6 @@ from jvr.io.volumes.units import millimetres
 MARKERS = ("zarr.json", ".zarray", ".zgroup")
 # Before OME-Zarr 0.3, which names its axes.
 OLD_AXES = ("t", "c", "z", "y", "x")
-# Codecs that run what they read, or hold no numbers.
-REFUSED_CODECS = ("pickle", "json2", "msgpack2", "vlen-utf8", "vlen-bytes", "vlen-array", "categorize")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,10 +195,6 @@ def _check(path: Path, found: Any, place: Chosen) -> None:
     """Refuses what is no array of numbers, holds no data or does not fit in memory, before a chunk is decoded."""
     if found.dtype.kind not in "biufc":
         raise VolumeError(path, f"the array holds {found.dtype}, not numbers; save it as real numbers")
-    codecs = [*(found.filters or ()), *(found.compressors or ())]
-    refused = [name for codec in codecs if (name := str(getattr(codec, "codec_id", ""))) in REFUSED_CODECS]
-    if refused:
-        raise VolumeError(path, f"its chunks are packed by '{refused[0]}', which is never run; save it with zstd, blosc or gzip")
     shape = [n for n, one in zip(found.shape, place.index, strict=True) if isinstance(one, slice)]
     check_size(path, shape, found.dtype.itemsize, None)
     if math.prod(found.chunks) * found.dtype.itemsize > 4 * math.prod(found.shape) * found.dtype.itemsize + 2**26:
