@@ -47,6 +47,9 @@ HEAVY = (
     "rich",
     "pydantic",
     "tifffile",
+    "imagecodecs",
+    "PIL",
+    "zarr",
 )
 
 
