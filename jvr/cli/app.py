@@ -13,6 +13,7 @@ from jvr.cli.inputs import (
     check_folder_output,
     check_image_output,
     check_inputs_stay,
+    explain,
     inputs_of,
     load,
     name_of,
@@ -38,6 +39,10 @@ Axes = Annotated[str | None, typer.Option(help="Names of the axes of a .npy, .ti
 Channel = Annotated[str | None, typer.Option(help="Which of several channels: its index from 0, or its name.")]
 Time = Annotated[int | None, typer.Option("--time", min=0, help="Which of several points in time: its index from 0.")]
 NanValue = Annotated[float | None, typer.Option(help="Number that takes the place of NaN and infinite voxels.")]
+Missing = Annotated[
+    str | None,
+    typer.Option(metavar="NUMBER|none", help='The number that means "no data", in data units.', show_default="by the file"),
+]
 Input = Annotated[Path, typer.Argument(metavar="CONFIG|VOLUME", help="A configuration (.toml) or a volume file.")]
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="A configuration (.toml).")]
 
@@ -64,12 +69,36 @@ def every_command(
     """What comes before a command."""
 
 
-@app.command(epilog=_examples("jvr render configs/demo.toml -o demo.png", "jvr render head.nii.gz --preset ct_bone --size 800"))
+@app.command(
+    epilog=_examples(
+        "jvr render configs/demo.toml -o demo.png",
+        "jvr render head.nii.gz --preset ct_bone --view front --size 800",
+        "jvr render scan.mhd --orbit 36 --background white",
+    )
+)
 def render(
     given: Input,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Picture, .exr or .png.", show_default="NAME.png")] = None,
     preset: Annotated[
-        str | None, typer.Option(help="ct_bone, ct_soft_tissue, ct_lung, ct_vessels; default: an automatic window.")
+        str | None,
+        typer.Option(
+            help="ct, ct_bone, ct_soft_tissue, ct_lung, ct_vessels (angiography), mr, micro_ct, scan, labels; default: by the values."
+        ),
+    ] = None,
+    view: Annotated[
+        str | None, typer.Option(help="oblique, front, back, left, right, top or bottom of the patient.", show_default="oblique")
+    ] = None,
+    up: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="What is up in the picture.", show_default="0,0,1")] = None,
+    background: Annotated[
+        str | None, typer.Option(help="A name, #rrggbb, or linear radiance as R,G,B.", show_default="black")
+    ] = None,
+    lit: Annotated[
+        bool | None,
+        typer.Option("--lit/--unlit", help="Surfaces under a light at the eye, or colours as they are.", show_default="lit"),
+    ] = None,
+    orbit: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="So many pictures from all around, and an animation (.gif).", show_default=False),
     ] = None,
     size: Annotated[int | None, typer.Option(min=1, help="Width and height in pixels, for every camera.")] = None,
     sets: Set = None,
@@ -80,21 +109,26 @@ def render(
     axes: Axes = None,
     channel: Channel = None,
     time: Time = None,
+    missing: Missing = None,
     nan_value: NanValue = None,
     as_json: Json = False,
 ) -> None:
     """Render a picture of a configuration's scene, or of a volume file directly."""
+    from jvr.cli.first import Wishes, configured
     from jvr.cli.render import render_pictures
 
     with reading():
         output = Path(f"{name_of(given)}.png") if output is None else output
         check_image_output(output)
-        transfer = None if preset is None else {"kind": "preset", "preset": preset}
-        volume = _given(shape, spacing, origin, dtype=dtype, axes=axes, channel=channel, time=time, nan_value=nan_value)
-        config = load(given, [*(sets or [])], volume, transfer)
-        if given.suffix.lower() == ".toml" or size is not None:
-            config = _sized(config, size)
-    report = render_pictures(config, output)
+        keywords = _given(
+            shape, spacing, origin, dtype=dtype, axes=axes, channel=channel, time=time, missing=missing, nan_value=nan_value
+        )
+        wishes = Wishes(preset, view, _triple(up, "--up", float, positive=False), background, orbit, lit)
+        config, volume, notes = configured(given, sets or [], keywords, wishes)
+        config = _sized(config, size)
+    for note in notes:
+        explain(f"note: {note}", 0)
+    report = render_pictures(config, output, volume, animated=orbit is not None) | {"notes": notes}
     lines = [*report["outputs"], *lines_of(report["precomputed"])]
     _print(
         report, as_json, "\n".join([*lines, f"{report['seconds']:.2f} s, of which {report['compile_seconds']:.2f} s compiling"])
@@ -207,6 +241,7 @@ def info(
     axes: Axes = None,
     channel: Channel = None,
     time: Time = None,
+    missing: Missing = None,
     nan_value: NanValue = None,
     array: Annotated[str | None, typer.Option(help="Which array of a .vtk, .vti or .zarr, or image of a .tif.")] = None,
     series: Annotated[str | None, typer.Option(help="Which series of a DICOM folder.")] = None,
@@ -218,7 +253,7 @@ def info(
         from jvr.io.volumes import read_volume
 
         choice = {"array": array, "series": series, "axes": axes, "channel": channel, "time": time}
-        keywords = _given(shape, spacing, origin, dtype=dtype, nan_value=nan_value, **choice)
+        keywords = _given(shape, spacing, origin, dtype=dtype, missing=missing, nan_value=nan_value, **choice)
         found = describe(read_volume(volume, **keywords), volume)
     _print(found, as_json, format_description(found))
 
@@ -244,7 +279,16 @@ def _given(shape: str | None, spacing: str | None, origin: str | None, **others:
     """Keywords of a volume from flags."""
     triples = {"shape": _triple(shape, "--shape", int), "spacing": _triple(spacing, "--spacing", float)}
     triples["origin"] = _triple(origin, "--origin", float, positive=False)
+    if (missing := others.pop("missing")) is not None:
+        triples["missing"] = False if missing.lower() == "none" else _number(missing, "--missing")
     return {name: value for name, value in (triples | others).items() if value is not None}
+
+
+def _number(text: str, flag: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise BadInput(f"{flag} {text}: must be a number, or none") from None
 
 
 def _triple(text: str | None, flag: str, kind: type, *, positive: bool = True) -> list[Any] | None:

@@ -7,21 +7,32 @@ from typing import Any
 import numpy as np
 
 from jvr.cli.beforehand import Beforehand
-from jvr.cli.inputs import BadInput, check_inputs_stay, inputs_of, reading, refused_by_jvr
+from jvr.cli.inputs import BadInput, check_inputs_stay, explain, inputs_of, reading, refused_by_jvr
 from jvr.cli.runtime import plain, progress, provenance, use_compilation_cache
+from jvr.io.animation import write_animation
 from jvr.io.config import Config, build_cameras, build_scene, build_settings
+from jvr.io.config.schema.transfer import PresetTable
+from jvr.io.first_picture import what_is_seen
+from jvr.model.volume import Volume
+
+# Seconds that an animation takes to go round.
+TURN = 6.0
 
 
-def render_pictures(config: Config, output: Path) -> dict[str, Any]:
-    """Renders every camera of a configuration: to `output`, or with several cameras to numbered files beside it."""
+def render_pictures(config: Config, output: Path, volume: Volume | None = None, *, animated: bool = False) -> dict[str, Any]:
+    """Renders every camera of a configuration: to `output`, or with several cameras to numbered files beside it, and where these are to be
+    `animated`, to a moving picture beside them. `volume`: that of the configuration, where it is read already."""
     use_compilation_cache()
     began = time.perf_counter()
     beforehand = Beforehand()
     with reading():
-        scene, settings = build_scene(config), build_settings(config)
-        cameras = build_cameras(config, scene.volume)
+        scene, settings = build_scene(config, volume), build_settings(config)
+        cameras = build_cameras(config, scene.volume, scene.transfer)
+        if isinstance(config.tables.transfer, PresetTable) and (note := what_is_seen(scene.volume, scene.transfer)):
+            explain(f"note: {note}", 0)
         outputs, inputs = _names(output, len(cameras)), inputs_of(config)
-        for path in outputs:
+        moving = output.with_suffix(".gif") if animated else None
+        for path in [*outputs, *([moving] if moving else [])]:
             check_inputs_stay(path, inputs)
         scene = beforehand(scene)
     import equinox as eqx
@@ -31,7 +42,7 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
     from jvr.pictures import write_image
     from jvr.rendering.image import render
 
-    pictures, compile_seconds = [], 0.0
+    pictures, frames, compile_seconds = [], [], 0.0
     if settings.skipping:
         scene = eqx.tree_at(lambda s: s.volume, scene, scene.volume.bricked())
     with progress("rendering"):
@@ -46,6 +57,10 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
             alpha = np.asarray(picture.alpha) if scene.background is None else None
             depth = {"depth": np.asarray(picture.depth)} if outputs[i].suffix.lower() == ".exr" else {}
             write_image(outputs[i], np.asarray(picture.rgb), alpha, **depth)
+            frames.extend([np.asarray(picture.rgb)] if moving else [])
+        if moving:
+            write_animation(moving, frames, seconds=TURN)
+            outputs.append(moving)
     return {
         "command": "render",
         "config": config.name,

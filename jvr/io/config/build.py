@@ -37,7 +37,7 @@ ORACLES = {"local-error": LocalError, "opacity-change": OpacityChange, "brick-ra
 INTERPOLATIONS = {"trilinear": Trilinear, "nearest": Nearest}
 OPTICAL = {"emission-absorption": EmissionAbsorption, "emission-only": EmissionOnly, "absorption-only": AbsorptionOnly}
 READ_KEYWORDS = ("shape", "dtype", "spacing", "origin", "direction", "slope", "intercept")
-READ_KEYWORDS += ("array", "series", "axes", "channel", "time", "nan_value")
+READ_KEYWORDS += ("array", "series", "axes", "channel", "time", "missing", "nan_value")
 
 
 class FitJob(NamedTuple):
@@ -82,8 +82,7 @@ def build_volume(config: Config) -> Volume:
     """
     table = config.tables.volume
     volume = _builtin() if table.path is None else _read(config, table, table.path)
-    interpolation = INTERPOLATIONS[table.interpolation]()
-    volume = eqx.tree_at(lambda v: v.interpolation, volume, interpolation)
+    volume = interpolated(config, volume)
     if table.scale is not None:
         low, high = table.scale
         scaled = (np.asarray(volume.values, np.float64) * float(volume.slope) + float(volume.intercept) - low) / (high - low)
@@ -95,6 +94,11 @@ def build_volume(config: Config) -> Volume:
         volume = eqx.tree_at(lambda v: (v.values, v.slope, v.intercept), volume, parts)
     with blame(config.name, "volume.packed"):
         return volume.packed() if table.packed else volume
+
+
+def interpolated(config: Config, volume: Volume) -> Volume:
+    """A volume with the interpolation that a configuration says."""
+    return eqx.tree_at(lambda v: v.interpolation, volume, INTERPOLATIONS[config.tables.volume.interpolation]())
 
 
 def build_scene(config: Config, volume: Volume | None = None) -> Scene:

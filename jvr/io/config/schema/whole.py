@@ -30,6 +30,7 @@ class VolumeTable(Table):
     axes: str | None = None
     channel: Annotated[int, whole("index of a channel", 0)] | str | None = None
     time: Annotated[int, whole("index of a point in time", 0)] | None = None
+    missing: Scalar | Literal[False] | None = None
     nan_value: Scalar | None = None
     interpolation: Literal["trilinear", "nearest"] = "trilinear"
     scale: Range | None = None

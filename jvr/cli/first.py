@@ -1,0 +1,68 @@
+"""`jvr render` of a volume file: a configuration made for what the file holds."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from jvr.cli.inputs import BadInput, load
+from jvr.io.config import Config, build_volume, config_from, interpolated
+from jvr.model.volume import Volume
+
+
+@dataclasses.dataclass(frozen=True)
+class Wishes:
+    """What somebody says about the picture of a volume; `None` where the volume decides."""
+
+    preset: str | None = None
+    view: str | None = None
+    up: list[float] | None = None
+    background: str | None = None
+    orbit: int | None = None
+    lit: bool | None = None
+
+    def named(self) -> str | None:
+        """The flag of one that is there."""
+        return next((f"--{field.name}" for field in dataclasses.fields(self) if getattr(self, field.name) is not None), None)
+
+
+def configured(given: Path, sets: list[str], keywords: dict[str, Any], wishes: Wishes) -> tuple[Config, Volume | None, list[str]]:
+    """The configuration of a picture, the volume where it is read already, and what was guessed, a line each."""
+    if given.suffix.lower() == ".toml":
+        if refused := wishes.named():
+            raise BadInput(f"{refused} is for a volume file; for a configuration use --set")
+        return load(given, sets, keywords), None, []
+    from jvr.io.first_picture import first_picture
+
+    volume = build_volume(load(given, [text for text in sets if text.startswith("volume.")], keywords))
+    tables, notes = first_picture(volume, given, wishes.preset, lit=wishes.lit is not False)
+    tables["volume"] = {"path": str(given.absolute()), **keywords, **tables.get("volume", {})}
+    tables["background"] = _colour(wishes.background or "black")
+    tables["camera"] |= _camera(wishes)
+    config = config_from(tables, str(given), given.parent, sets)
+    return config, interpolated(config, volume), notes
+
+
+def _camera(wishes: Wishes) -> dict[str, Any]:
+    if wishes.orbit is None:
+        return {name: value for name, value in (("view", wishes.view), ("up", wishes.up)) if value is not None}
+    if wishes.orbit < 2:
+        raise BadInput(f"--orbit {wishes.orbit}: must be at least 2 pictures")
+    if wishes.view is not None:
+        raise BadInput("--view: an orbit looks from all around; leave --view or --orbit out")
+    return {"kind": "orbit", "count": wishes.orbit, **({} if wishes.up is None else {"axis": wishes.up})}
+
+
+def _colour(text: str) -> list[float]:
+    """A background as linear radiance: a name, `#rrggbb`, or three numbers that are linear already."""
+    from matplotlib.colors import to_rgb
+
+    from jvr.pictures import linear_from_srgb
+
+    try:
+        if "," in text:
+            red, green, blue = (float(part) for part in text.split(","))
+            return [red, green, blue]
+        return [float(c) for c in linear_from_srgb(to_rgb(text))]
+    except ValueError:
+        example = "white, #20242c, or three numbers of linear radiance such as 0.1,0.1,0.2"
+        raise BadInput(f"--background {text}: must be a colour such as {example}") from None
