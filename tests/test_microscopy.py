@@ -10,6 +10,9 @@ import tifffile
 import zarr
 from PIL import Image
 
+from jvr import cli
+from jvr.io.config import config_from
+from jvr.io.config.build import build_volume
 from jvr.io.volumes import VolumeError, read_volume
 from jvr.io.volumes.given import Given
 from jvr.io.volumes.tiff import read_tiff
@@ -184,6 +187,14 @@ def test_ome_tiff_sizes_channels_and_images(tmp_path):
         volume = read_volume(path, channel="a > b")
     np.testing.assert_array_equal(volume.values, values[1].T)
     np.testing.assert_allclose(spacing_of(volume), [5e-7, 5e-4, 5e-7], rtol=1e-6)
+    tifffile.imwrite(
+        path,
+        values[0],
+        metadata={"axes": "ZYX"} | {f"PhysicalSize{a}{b}": c for a in "XYZ" for b, c in (("", 2), ("Unit", "pixel"))},
+    )
+    with pytest.warns(UserWarning, match="PhysicalSizeXUnit, PhysicalSizeYUnit, PhysicalSizeZUnit: the unit 'pixel'") as said:
+        np.testing.assert_array_equal(spacing_of(read_volume(path)), 2)
+    assert len(said) == 1
     with tifffile.TiffWriter(path, ome=True) as file:
         for k, name in enumerate(("overview", "scan")):
             sizes = {f"PhysicalSize{a}": 2.0 + k for a in "XYZ"} | {f"PhysicalSize{a}Unit": "nm" for a in "XYZ"}
@@ -277,7 +288,8 @@ def test_both_transformations_units_and_channel_names_of_ome_zarr(tmp_path, zarr
     assert len(said) == 1
     image["coordinateTransformations"] = [{"type": "scale", "scale": [1, 2]}]
     ome_zarr(path, values, image, zarr_format=zarr_format)
-    fails("coordinateTransformations", path, time=1, channel=1)
+    fails("coordinateTransformations.*spacing=", path, time=1, channel=1)
+    np.testing.assert_allclose(spacing_of(silent(path, time=1, channel=1, spacing=2, origin=(0, 0, 0))), 2)
 
 
 def test_old_ome_zarr_and_the_layout_of_bioformats2raw(tmp_path):
@@ -363,3 +375,34 @@ def test_slices_that_are_no_volume(tmp_path):
     (tmp_path / "a2.png").unlink()
     save("a2.bmp", stack(4, 5, dtype="u1"))
     fails("several kinds.*a1.png.*a2.bmp", tmp_path)
+
+
+# --- Command line, configuration, packages ---------------------------------------------------------------------------
+
+
+def test_flags_and_configuration_keys_choose_channel_and_time(tmp_path, capsys):
+    values = stack(2, 3, 4, 5, 6)
+    np.save(tmp_path / "a.npy", values)
+    flags = ["--axes", "tczyx", "--channel", "2", "--time", "1", "--spacing", "1,2,3", "--origin", "-4,5,6", "--json"]
+    assert cli.run(["info", str(tmp_path / "a.npy"), *flags]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["shape"], [found["minimum"], found["maximum"]]) == (
+        [6, 5, 4],
+        [int(values[1, 2].min()), int(values[1, 2].max())],
+    )
+    table = {"path": "a.npy", "axes": "tczyx", "channel": 2, "time": 1, "slope": 2, "intercept": 1}
+    table |= {"direction": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], "spacing": [1, 2, 3], "origin": [-4, 5, 6]}
+    volume = build_volume(config_from({"volume": table, "transfer": {"kind": "window"}}, "test", tmp_path))
+    np.testing.assert_array_equal(volume.values, values[1, 2].T)
+    np.testing.assert_array_equal(volume.world_from_grid, [[0, 2, 0, -4], [-1, 0, 0, 5], [0, 0, 3, 6], [0, 0, 0, 1]])
+    assert (float(volume.slope), float(volume.intercept)) == (2, 1)
+
+
+def test_what_to_install_where_a_decoder_is_missing(tmp_path, monkeypatch):
+    tifffile.imwrite(tmp_path / "a.tif", stack(3, 4, 5), compression="lzw", photometric="minisblack")
+
+    def missing(*_, **__):
+        raise ValueError("<COMPRESSION.LZW: 5> requires the 'imagecodecs' package")
+
+    monkeypatch.setattr(tifffile.TiffPageSeries, "asarray", missing)
+    fails("pip install imagecodecs", tmp_path / "a.tif", spacing=1)

@@ -2,8 +2,8 @@
 
 import dataclasses
 import re
+import warnings
 from pathlib import Path
-from typing import Any
 
 from jvr.io.volumes.errors import VolumeError, grid_numbers, one_line
 from jvr.io.volumes.given import Given
@@ -52,19 +52,19 @@ def ome_spacing(path: Path, pixels: dict[str, str], depth: int, given: Given) ->
     """Voxel size in mm along x, y, z. A unit that is not named is a micrometre, as the schema says; a size that is missing is said."""
     if given.spacing is not None:
         return [1.0, 1.0, 1.0]
-    sizes: list[Any] = [None, None, None]
-    for k, axis in enumerate("XYZ"):
-        field = f"PhysicalSize{axis}"
-        if field in pixels and not (axis == "Z" and depth == 1):
-            size = grid_numbers(path, f"its {field}", [pixels[field]], positive=True)[0]
-            sizes[k] = size * millimetres(path, f"{field}Unit", pixels.get(f"{field}Unit", "µm"))
+    stated = [axis for axis in "XYZ" if f"PhysicalSize{axis}" in pixels and not (axis == "Z" and depth == 1)]
+    units = {axis: pixels.get(f"PhysicalSize{axis}Unit", "µm") for axis in stated}
+    fields = {unit: ", ".join(f"PhysicalSize{axis}Unit" for axis in stated if units[axis] == unit) for unit in units.values()}
+    lengths = {unit: millimetres(path, field, unit) for unit, field in fields.items()}
+    sizes: list[float | None] = [None, None, None]
+    for axis in stated:
+        size = grid_numbers(path, f"its PhysicalSize{axis}", [pixels[f"PhysicalSize{axis}"]], positive=True)[0]
+        sizes["XYZ".index(axis)] = size * lengths[units[axis]]
     return completed(path, sizes, depth, "PhysicalSizeX, PhysicalSizeY, PhysicalSizeZ of its OME-XML")
 
 
 def completed(path: Path, sizes: list[float | None], depth: int, field: str) -> list[float]:
     """Voxel sizes where the file gives some or none: a missing one is that of x (or y), or 1 mm, with a warning that says which."""
-    import warnings
-
     known = next((size for size in sizes if size is not None), None)
     missing = [axis for axis, size in zip("xyz", sizes, strict=True) if size is None and not (axis == "z" and depth == 1)]
     taken = 1.0 if known is None else known

@@ -83,8 +83,9 @@ def _say_gaps(path: Path, files: list[Path]) -> None:
     if len(varying) != 1:
         return
     steps = np.diff(numbers[:, varying[0]])
-    usual = min(steps)
-    gaps = [k for k, step in enumerate(steps) if step != usual]
+    # Names such as 1 and 01 have the same number.
+    usual = min(step for step in steps if step > 0)
+    gaps = [k for k, step in enumerate(steps) if step not in (0, usual)]
     if gaps:
         k = gaps[0]
         where = f"no slice lies between {files[k].name} and {files[k + 1].name}" + (

@@ -21,6 +21,7 @@ JPEG = 7
 COMPRESSIONS = {1: 1, 5: 2731, 8: 1100, 32946: 1100, 32773: 64, JPEG: None, 2: None, 3: None, 4: None, 34925: None, 50000: None}
 GREY = (0, 1)
 PALETTE = 3
+RGB = (2, 6)
 COLOURS = ("red", "green", "blue")
 # Of the tag ResolutionUnit, in mm; 1 is none.
 RESOLUTION_UNITS = {2: 25.4, 3: 10.0}
@@ -161,7 +162,7 @@ def _axes(path: Path, series: Any, given: Given) -> list[str]:
     letters, photometric = list(series.axes.upper()), int(series.keyframe.photometric)
     if photometric == PALETTE or ("S" in letters and photometric not in GREY and given.channel is None):
         shape = f"(shape {series.shape}, axes {series.axes})"
-        remedy = "convert them to grey" + ("" if photometric == PALETTE else ", or choose channel=0 (red), 1 (green) or 2 (blue)")
+        remedy = "convert them to grey" + (", or choose channel=0 (red), 1 (green) or 2 (blue)" if photometric in RGB else "")
         raise VolumeError(path, f"its pages are in colour {shape}: {remedy}")
     letters = ["c" if letter == "S" and "C" not in letters else letter for letter in letters]
     long = [k for k, (letter, n) in enumerate(zip(letters, series.shape, strict=True)) if n > 1 and letter not in "XYc"]
@@ -177,7 +178,7 @@ def _channels(series: Any, names: list[str], image: OmeImage | None) -> list[str
     count = dict(zip("".join(name[0] for name in names).upper(), series.shape, strict=True)).get("C", 0)
     if image is not None and len(image.channels) == count:
         return image.channels
-    if int(series.keyframe.photometric) not in GREY and series.axes.endswith("S"):
+    if int(series.keyframe.photometric) in RGB and series.axes.endswith("S"):
         return list(COLOURS[: series.shape[-1]])
     return []
 
@@ -235,9 +236,8 @@ def _imagej_spacing(
         raise VolumeError(
             path, f"ImageJ's spacing is '{metadata['spacing']}'; it must be a number that is not 0: give spacing= in mm"
         )
-    if between is None and depth > 1 and length_of(name) is not None:
-        warnings.warn(
-            f"{path}: no spacing between slices is given: 1 {name} is taken, as ImageJ does; give spacing= in mm", stacklevel=2
-        )
+    if between is None and depth > 1 and (length_of(name) is not None or (name is None and unit is not None)):
+        problem = f"no spacing between slices is given: {scales[2]:.6g} mm is taken, one unit, as ImageJ does"
+        warnings.warn(f"{path}: {problem}; give spacing= in mm", stacklevel=2)
     along = [1.0 if size is None else size for size in sizes] + [1.0 if between is None else between]
     return [size * scale for size, scale in zip(along, scales, strict=True)]

@@ -91,14 +91,14 @@ def _found(path: Path, zarr: Any, node: Any, given: Given) -> tuple[Any, Level |
         name = _series(path, zarr, node)
     inner = node if name is None else node.get(name.strip("/"))
     if isinstance(inner, zarr.Group):
-        level = _level(path, inner, None)
+        level = _level(path, inner, None, given)
         if level is not None:
             return _array(path, zarr, inner, level.path), level
     if name is None or not isinstance(inner, zarr.Array):
         return _array(path, zarr, node, name), None
     above, _, last = name.strip("/").rpartition("/")
     parent = node.get(above) if above else node
-    return inner, _level(path, parent, last) if isinstance(parent, zarr.Group) else None
+    return inner, _level(path, parent, last, given) if isinstance(parent, zarr.Group) else None
 
 
 def _array(path: Path, zarr: Any, group: Any, name: str | None) -> Any:
@@ -140,7 +140,7 @@ def _series(path: Path, zarr: Any, group: Any) -> str | None:
     return series[0]
 
 
-def _level(path: Path, group: Any, name: str | None) -> Level | None:
+def _level(path: Path, group: Any, name: str | None, given: Given) -> Level | None:
     """What OME-Zarr says of the finest level, or of the one whose array is called `name`; `None` where the group is no OME-Zarr image."""
     scales = _multiscales(group)
     if not scales:
@@ -166,7 +166,10 @@ def _level(path: Path, group: Any, name: str | None) -> Level | None:
             or (kind == "scale" and not (values > 0).all())
         ):
             problem = f"its coordinateTransformations hold '{kind}' {step.get(kind, '')}; {len(axes)} finite numbers are read"
-            raise VolumeError(path, f"{problem}, positive where they scale, of kinds 'scale' and 'translation'")
+            if given.spacing is not None:
+                continue
+            problem += ", positive where they scale, of kinds 'scale' and 'translation'"
+            raise VolumeError(path, f"{problem}: give spacing= and origin= in mm")
         scale, shift = (scale * values, shift * values) if kind == "scale" else (scale, shift + values)
     omero = _metadata(group).get("omero") or group.attrs.get("omero") or {}
     channels = [str(channel.get("label", "")) for channel in omero.get("channels", [])]
@@ -228,7 +231,9 @@ def _affine(path: Path, level: Level | None, place: Chosen, given: Given) -> np.
             alike = ", ".join(
                 name for name, other in zip(level.names, level.units, strict=True) if other == unit and name not in "ct"
             )
-            lengths[unit] = 1.0 if given.spacing is not None else millimetres(path, f"the unit of its axes {alike}", unit)
+            # With the caller's spacing, the unit matters to the position alone.
+            asked = given.spacing is None or any(level.shift[k] for k in place.kept if k is not None)
+            lengths[unit] = millimetres(path, f"the unit of its axes {alike}", unit) if asked else 1.0
         spacing[axis], origin[axis] = level.scale[k] * lengths[unit], level.shift[k] * lengths[unit]
     return affine_of(spacing, origin)
 
