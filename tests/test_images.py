@@ -178,6 +178,28 @@ def test_every_kind_of_png_is_colour_in_the_end(tmp_path, mode):
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), np.ones((9, 7, 3), np.float32))
 
 
+def test_what_a_file_says_of_itself_and_is_not_used_is_named(tmp_path):
+    red = Image.new("RGB", (3, 2), (255, 0, 0))
+    red.save(tmp_path / "profile.png", icc_profile=b"some camera's own")
+    red.save(tmp_path / "many.png", save_all=True, append_images=[Image.new("RGB", (3, 2))])
+    red.convert("CMYK").save(tmp_path / "inks.jpg")
+    for name, match in (("profile.png", "profile that is not sRGB"), ("many.png", "2 pictures, the first"), ("inks.jpg", "inks")):
+        with pytest.warns(UserWarning, match=f"{name}: .*{match}"):
+            read_image(tmp_path / name)
+
+
+def test_a_photograph_is_upright(tmp_path):
+    """Orientation 6: what is the left column of the file is the top row for the eye."""
+    image = Image.new("L", (2, 4))
+    image.putpixel((0, 3), 255)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    image.save(tmp_path / "a.png", exif=exif)
+    found = read_image(tmp_path / "a.png")
+    assert found.shape == (2, 4, 3)
+    assert np.argwhere(found[..., 0]).tolist() == [[0, 0]]
+
+
 def test_jpeg_is_srgb_too(tmp_path):
     Image.new("RGB", (16, 8), (188, 188, 188)).save(tmp_path / "a.JPG", format="JPEG", quality=95)
     np.testing.assert_allclose(read_image(tmp_path / "a.JPG"), np.full((8, 16, 3), 0.503), atol=0.01)

@@ -1,6 +1,8 @@
 """Images read: OpenEXR and Radiance as linear radiance, PNG and JPEG through the sRGB curve. `jvr.pictures` writes them."""
 
 import os
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +29,8 @@ def read_image(path: str | os.PathLike) -> Pixels:
       An alpha plays no part: EXR's colours are light over black already. A cropped file is placed on black where its display
       window says.
     - `.hdr`: Radiance, 8 bits per channel and a common exponent; divided by the exposure that its header states.
-    - `.png`, `.jpg`: 8 or 16 bits, taken as sRGB whatever profile the file carries; with an alpha the colours are multiplied by
-      it, so that the result is light over black too.
+    - `.png`, `.jpg`: 8 or 16 bits, taken as sRGB, with a warning where the file says otherwise; turned as its EXIF says; with an
+      alpha the colours are multiplied by it, so that the result is light over black too.
 
     **Raises** `FileNotFoundError`, or `ImageError` (a `ValueError`) for a file that is empty, damaged, cut short, of another kind
     than its name says, or without colour channels.
@@ -163,12 +165,28 @@ def _read_srgb(path: Path, start: bytes) -> Pixels:
 
 def _eight_bits(path: Path) -> Float[np.ndarray, "..."]:
     """Codes 0 ... 1 of everything but colour with 16 bits."""
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     with Image.open(path) as image:
+        for guess in _guesses(image):
+            warnings.warn(f"{path}: {guess}", stacklevel=4)
+        image = ImageOps.exif_transpose(image)
         if image.mode.startswith("I"):
             return np.asarray(image).astype(np.float64) / 65535
         return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB")) / 255.0
+
+
+def _guesses(image: Any) -> Iterator[str]:
+    """What a file says of itself that plays no part in how it is read."""
+    if getattr(image, "n_frames", 1) > 1:
+        yield f"holds {image.n_frames} pictures, the first is read"
+    if image.mode == "CMYK":
+        yield "holds inks (CMYK), converted without their profile; export it as sRGB"
+    profile, gamma = image.info.get("icc_profile"), image.info.get("gamma", 1 / 2.2)
+    if profile and b"sRGB" not in profile and b"s\0R\0G\0B" not in profile:
+        yield "carries a colour profile that is not sRGB, its codes are taken as sRGB; export it as sRGB"
+    elif not profile and "srgb" not in image.info and abs(gamma * 2.2 - 1) > 0.02:
+        yield f"states a gamma of 1 / {1 / gamma:.3g}, its codes are taken as sRGB; export it as sRGB"
 
 
 def _sixteen_bits(path: Path) -> Float[np.ndarray, "..."]:
