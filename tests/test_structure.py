@@ -32,6 +32,7 @@ HEAVY = (
     "typer",
     "rich",
     "pydantic",
+    "pydicom",
     "tifffile",
 )
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from jvr.io.volumes.arrays import read_npy, read_raw, read_zarr
-from jvr.io.volumes.dicom import read_dicom_file, read_dicom_folder
+from jvr.io.volumes.dicom import looks_like_dicom, read_dicom_file, read_dicom_folder
 from jvr.io.volumes.errors import VolumeError, first_bytes
 from jvr.io.volumes.given import Given
 from jvr.io.volumes.itk import read_metaimage, read_nrrd
@@ -36,7 +36,7 @@ READERS: dict[str, tuple[Callable[[Path, Given], Stored], tuple[str, ...]]] = {
     ".nhdr": (read_nrrd, ()),
     ".nii": (read_nifti, ()),
     ".nii.gz": (read_nifti, ()),
-    ".dcm": (read_dicom_file, ()),
+    ".dcm": (read_dicom_file, ("channel", "time")),
     ".vtk": (read_legacy_vtk, ("array",)),
     ".vti": (read_vti, ("array",)),
     ".tif": (read_tiff, ()),
@@ -160,7 +160,7 @@ def _reader(path: Path, *, raw: bool) -> tuple[Callable[[Path, Given], Stored], 
     ending = next((ending for ending in (".nii.gz", path.suffix.lower()) if name.endswith(ending) and ending in READERS), None)
     if path.is_dir():
         is_zarr = ending == ".zarr" or any((path / marker).exists() for marker in ("zarr.json", ".zarray", ".zgroup"))
-        return READERS[".zarr"] if is_zarr else (read_dicom_folder, ("series",))
+        return READERS[".zarr"] if is_zarr else (read_dicom_folder, ("series", "channel", "time"))
     first_bytes(path, 1)
     if ending == ".zarr":
         raise VolumeError(path, "a Zarr is a folder, this is a file; unpack it first")
@@ -168,6 +168,8 @@ def _reader(path: Path, *, raw: bool) -> tuple[Callable[[Path, Given], Stored], 
         return READERS[ending]
     if raw:
         return read_raw, ("shape", "dtype")
+    if looks_like_dicom(first_bytes(path, 160)):
+        return READERS[".dcm"]
     shown = "".join(path.suffixes[-2:]) if name.endswith(".gz") else path.suffix
     known = ", ".join(ending for ending in READERS)
     problem = f"unsupported extension '{shown}'; supported: {known}, a folder of DICOM slices"
