@@ -51,7 +51,8 @@ def picture(pixels, number=1, *, series="1", **values):
     bits = pixels.dtype.itemsize * 8
     dataset = elements(
         Dataset(), SOPClassUID=CTImageStorage, SOPInstanceUID=f"{UID}{series}.{number}", SeriesInstanceUID=UID + series,
-        StudyInstanceUID=UID + "9", FrameOfReferenceUID=UID + "8", Modality="CT", InstanceNumber=number, ImageType=["ORIGINAL", "PRIMARY", "AXIAL"],
+        FrameOfReferenceUID=UID + "8",
+        StudyInstanceUID=UID + "9", Modality="CT", InstanceNumber=number, ImageType=["ORIGINAL", "PRIMARY", "AXIAL"],
         Rows=pixels.shape[-2], Columns=pixels.shape[-1], SamplesPerPixel=1, PhotometricInterpretation="MONOCHROME2",
         BitsAllocated=bits, BitsStored=bits, HighBit=bits - 1, PixelRepresentation=int(pixels.dtype.kind == "i"),
         PixelSpacing=[SPACING[1], SPACING[0]], SliceThickness=2.0, ImageOrientationPatient=AXIAL,
@@ -113,7 +114,7 @@ def assert_same(volume, values, position=lambda k: (10.0, -20.0, 30.5 + 3.0 * k)
     """Every voxel in data units, and where the corners lie."""
     np.testing.assert_allclose(data(volume), values, rtol=1e-6, atol=1e-4)
     for i, j, k in ((0, 0, 0), (2, 1, 0), (3, 2, values.shape[2] - 1)):
-        wanted = np.array(position(k)) + [i * spacing[0], j * spacing[1], 0]
+        wanted = np.array(position(k)) + np.array([i * spacing[0], j * spacing[1], 0])
         np.testing.assert_allclose((np.asarray(volume.world_from_grid) @ [i, j, k, 1])[:3], wanted, rtol=1e-5, atol=1e-4)
 
 
@@ -350,6 +351,17 @@ def test_compressed_pixels(tmp_path, kind):
     dataset.PixelData = bytes(stream)
     saved(dataset, tmp_path / "b.dcm", pydicom.uid.UID("1.2.840.10008.1.2.4." + kind))
     fails("compressed pixels are damaged", tmp_path / "b.dcm")
+
+
+def test_a_codestream_that_is_larger_than_its_header_says(tmp_path):
+    stream = bytearray(_encoded("90", np.zeros((24, 32), "u2")))
+    size = stream.index(b"\xff\x51") + 6
+    # Picture and tile of 30,000 x 30,000, 1.8 GB.
+    for at in (0, 16):
+        stream[size + at : size + at + 8] = (30000).to_bytes(4, "big") * 2
+    dataset = picture(np.zeros((24, 32), "u2"), PixelData=encapsulate([bytes(stream)]))
+    dataset["PixelData"].is_undefined_length = True
+    fails("compressed pixels are damaged", saved(dataset, tmp_path / "a.dcm", pydicom.uid.JPEG2000Lossless))
 
 
 def test_run_lengths(tmp_path):
