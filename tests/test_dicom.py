@@ -230,7 +230,7 @@ def test_copies_count_once_and_doubles_are_named(tmp_path):
     "name", ["EchoTime", "TemporalPositionIdentifier", "DiffusionBValue", "AcquisitionNumber", "InstanceNumber"]
 )
 def test_series_of_several_volumes(tmp_path, name):
-    told_apart = lambda k, t: {"SOPInstanceUID": f"{UID}1.{t}{k}", name: 5 + t * 3 + k * (name[0] == "I")}
+    told_apart = lambda k, t: {"SOPInstanceUID": f"{UID}1.{t + 1}{k}", name: 5 + t * 3 + k * (name[0] == "I")}
     for t in range(2):
         values = voxels() + np.int16(1000 * t)
         slices(
