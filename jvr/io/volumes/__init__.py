@@ -79,7 +79,7 @@ def read_volume(
     Zarr (.zarr) and headerless raw (.raw, .bin, .dat, or any ending where `shape` and `dtype` are given).
 
     Integer voxels stay integers (32 and 64-bit ones as narrow as their values fit), floats become float32 unless x64 is
-    on. A file's slope and intercept become those of the `Volume`, or are applied where its reader does so (DICOM).
+    on. A file's slope and intercept become those of the `Volume`, or are applied where DICOM slices have their own.
     A 2-D image becomes one voxel thick.
 
     **Arguments:**
