@@ -46,6 +46,7 @@ HEAVY = (
     "typer",
     "rich",
     "pydantic",
+    "pydicom",
     "tifffile",
     "imagecodecs",
     "PIL",

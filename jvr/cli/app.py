@@ -277,7 +277,7 @@ def demo(
 
 def _given(shape: str | None, spacing: str | None, origin: str | None, **others: Any) -> dict[str, Any]:
     """Keywords of a volume from flags."""
-    triples = {"shape": _triple(shape, "--shape", int), "spacing": _triple(spacing, "--spacing", float)}
+    triples: dict[str, Any] = {"shape": _triple(shape, "--shape", int), "spacing": _triple(spacing, "--spacing", float)}
     triples["origin"] = _triple(origin, "--origin", float, positive=False)
     if (missing := others.pop("missing")) is not None:
         triples["missing"] = False if missing.lower() == "none" else _number(missing, "--missing")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from jvr.io.volumes.arrays import read_npy, read_raw
-from jvr.io.volumes.dicom import read_dicom_file, read_dicom_folder
+from jvr.io.volumes.dicom import looks_like_dicom, read_dicom_file, read_dicom_folder
 from jvr.io.volumes.errors import VolumeError, first_bytes
 from jvr.io.volumes.given import Given
 from jvr.io.volumes.itk import read_metaimage, read_nrrd
@@ -38,7 +38,7 @@ READERS: dict[str, tuple[Callable[[Path, Given], Stored], tuple[str, ...]]] = {
     ".nhdr": (read_nrrd, ()),
     ".nii": (read_nifti, ()),
     ".nii.gz": (read_nifti, ()),
-    ".dcm": (read_dicom_file, ()),
+    ".dcm": (read_dicom_file, ("channel", "time")),
     ".vtk": (read_legacy_vtk, ("array",)),
     ".vti": (read_vti, ("array",)),
     ".tif": (read_tiff, ("array", "axes", "channel", "time")),
@@ -85,7 +85,7 @@ def read_volume(
     raw (.raw, .bin, .dat, or any ending where `shape` and `dtype` are given).
 
     Integer voxels stay integers (32 and 64-bit ones as narrow as their values fit), floats become float32 unless x64 is
-    on. A file's slope and intercept become those of the `Volume`, or are applied where its reader does so (DICOM).
+    on. A file's slope and intercept become those of the `Volume`, or are applied where DICOM slices have their own.
     A 2-D image becomes one voxel thick.
 
     **Arguments:**
@@ -179,7 +179,7 @@ def _reader(path: Path, *, raw: bool) -> tuple[Callable[[Path, Given], Stored], 
     if path.is_dir():
         if ending == ".zarr" or is_zarr(path):
             return READERS[".zarr"]
-        return (read_slices, ()) if is_slices(path) else (read_dicom_folder, ("series",))
+        return (read_slices, ()) if is_slices(path) else (read_dicom_folder, ("series", "channel", "time"))
     first_bytes(path, 1)
     if ending == ".zarr":
         raise VolumeError(path, "a Zarr is a folder, this is a file; unpack it first")
@@ -187,6 +187,8 @@ def _reader(path: Path, *, raw: bool) -> tuple[Callable[[Path, Given], Stored], 
         return READERS[ending]
     if raw:
         return read_raw, ("shape", "dtype")
+    if looks_like_dicom(first_bytes(path, 160)):
+        return READERS[".dcm"]
     shown = "".join(path.suffixes[-2:]) if name.endswith(".gz") else path.suffix
     known = ", ".join(ending for ending in READERS)
     problem = f"unsupported extension '{shown}'; supported: {known}, a folder of DICOM, PNG, TIFF, BMP or JPEG slices"
