@@ -408,8 +408,8 @@ def test_gradients_against_differences_with_the_placement_frozen(x64, optical):
         along, h = random_like(p[name]), 1e-6
         moved = [{**p, name: jax.tree.map(lambda x, d, t=t: x + t * d, p[name], along)} for t in (h, -h)]
         (high, more), (low, less) = map(value, moved)
-        np.testing.assert_array_equal(more.samples, stats.samples)
-        np.testing.assert_array_equal(less.samples, stats.samples)
+        np.testing.assert_array_equal(more.samples, stats.samples, err_msg=name)
+        np.testing.assert_array_equal(less.samples, stats.samples, err_msg=name)
         found = sum(jnp.vdot(g, d) for g, d in zip(jax.tree.leaves(gradient[name]), jax.tree.leaves(along), strict=True))
         # h^2, and the rounding of a loss of some hundreds over h.
         np.testing.assert_allclose(found, (high - low) / (2 * h), rtol=1e-6, atol=3e-6, err_msg=name)

@@ -95,10 +95,14 @@ def test_the_head_and_its_maps_have_their_up_and_front_where_the_world_has_them(
 
 @pytest.mark.parametrize("name", ["shadowed_fit.toml", pytest.param("real/shadowed_fit.toml", marks=pytest.mark.slow)])
 @pytest.mark.slow
-def test_configurations_of_the_shadowed_fit_describe_the_same_experiment(name, request):
+def test_configurations_of_the_shadowed_fit_describe_the_same_experiment(name, request, monkeypatch):
     if name.startswith("real"):
-        request.getfixturevalue("data")
-    job = build_fit(read_config(shadowed_fit.CONFIGS / name, ["camera.width=4", "camera.height=4", "settings.step=8.0"]))
+        monkeypatch.setenv("JVR_DATA", str(request.getfixturevalue("data")))
+    config = read_config(shadowed_fit.CONFIGS / name)
+    several = isinstance(config.data["camera"], list)
+    places = [f"camera.{i}" for i in range(len(config.data["camera"]))] if several else ["camera"]
+    small = [f"{place}.{side}=4" for place in places for side in ("width", "height")]
+    job = build_fit(read_config(shadowed_fit.CONFIGS / name, [*small, "settings.step=8.0"]))
     assert isinstance(job.scene.shadows, jvr.ShadowVolume)
     assert job.scene.transfer.sigma_t.shape == job.truth.sigma_t.shape == (16,)
     assert job.held_out is not None

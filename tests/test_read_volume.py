@@ -538,7 +538,7 @@ def test_voxels_that_are_not_finite_are_counted_or_replaced(tmp_path):
 
 @pytest.mark.parametrize(
     ("kind", "number", "slope", "inter"),
-    [("i2", -2000, 1.0, 0.0), ("i2", -2000, 1.0, -1024.0), ("i2", -32768, 1.0, 0.0), ("f4", -3.4028235e38, 1.0, 0.0)],
+    [("i2", -2000, 1.0, 0.0), ("i2", -2000, 1.0, -1024.0), ("i2", -32768, 1.0, 0.0), ("f4", -9999, 1.0, 0.0)],
 )
 def test_padding_is_found_and_said(tmp_path, kind, number, slope, inter):
     code = {"i2": 4, "f4": 16}[kind]
@@ -550,6 +550,15 @@ def test_padding_is_found_and_said(tmp_path, kind, number, slope, inter):
     np.testing.assert_array_equal(np.asarray(volume.gaps) & 1 > 0, values == number)
     assert float(jnp.min(volume.values)) == values[values != number].min()
     assert read_volume(tmp_path / "a.nii", missing=False).gaps is None
+
+
+def test_numbers_beyond_all_measurement_are_missing(tmp_path):
+    values = voxels("f4")
+    values[:2] = -3.4028235e38
+    np.save(tmp_path / "a.npy", values)
+    with pytest.warns(UserWarning, match="30 voxels lie beyond 1e30: they count as missing"):
+        volume = read_volume(tmp_path / "a.npy")
+    np.testing.assert_array_equal(np.asarray(volume.gaps) & 1 > 0, values < -1e30)
 
 
 def test_padding_is_what_the_caller_says_and_no_more(tmp_path):

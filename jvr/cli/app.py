@@ -128,7 +128,8 @@ def render(
         config = _sized(config, size)
     for note in notes:
         explain(f"note: {note}", 0)
-    report = render_pictures(config, output, volume, animated=orbit is not None) | {"notes": notes}
+    report = render_pictures(config, output, volume, animated=orbit is not None)
+    report["notes"] = notes
     lines = [*report["outputs"], *lines_of(report["precomputed"])]
     _print(
         report, as_json, "\n".join([*lines, f"{report['seconds']:.2f} s, of which {report['compile_seconds']:.2f} s compiling"])

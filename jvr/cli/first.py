@@ -37,19 +37,21 @@ def configured(given: Path, sets: list[str], keywords: dict[str, Any], wishes: W
     tables, notes = first_picture(volume, given, wishes.preset, lit=wishes.lit is not False)
     tables["volume"] = {"path": str(given.absolute()), **keywords, **tables.get("volume", {})}
     tables["background"] = _colour(wishes.background or "black")
-    tables["camera"] |= _camera(wishes)
+    tables["camera"] = _camera(wishes, tables["camera"])
     config = config_from(tables, str(given), given.parent, sets)
     return config, interpolated(config, volume), notes
 
 
-def _camera(wishes: Wishes) -> dict[str, Any]:
+def _camera(wishes: Wishes, guessed: dict[str, Any]) -> dict[str, Any]:
+    """The table of the camera, or of the cameras of an orbit."""
     if wishes.orbit is None:
-        return {name: value for name, value in (("view", wishes.view), ("up", wishes.up)) if value is not None}
+        return guessed | {name: value for name, value in (("view", wishes.view), ("up", wishes.up)) if value is not None}
     if wishes.orbit < 2:
         raise BadInput(f"--orbit {wishes.orbit}: must be at least 2 pictures")
     if wishes.view is not None:
         raise BadInput("--view: an orbit looks from all around; leave --view or --orbit out")
-    return {"kind": "orbit", "count": wishes.orbit, **({} if wishes.up is None else {"axis": wishes.up})}
+    around = {"kind": "orbit", "count": wishes.orbit, "frame": guessed["frame"]}
+    return around if wishes.up is None else around | {"axis": wishes.up}
 
 
 def _colour(text: str) -> list[float]:

@@ -22,6 +22,8 @@ SUBSET = 1 << 20
 MOST_LABELS, EQUAL = 256, 0.8
 # Gradients, in contrasts of the volume per voxel, from which on there are surfaces.
 SURFACE = 0.08
+# The share of its largest extent up to which a volume is a slice.
+THIN = 0.05
 LIGHTS = [{"kind": "head", "irradiance": 1.0}, {"kind": "ambient", "radiance": 1.0}]
 SHADING = {"kind": "blinn-phong", "ambient": 0.35, "diffuse": 0.75, "specular": 0.15, "shininess": 20.0}
 
@@ -43,7 +45,7 @@ def first_picture(volume: Volume, path: Path, preset: str | None = None, *, lit:
     if kind is None:
         kind, why = _kind(volume)
         notes.append(f"{why}: shown as {kind} (--preset says otherwise)")
-    tables: dict[str, Any] = {"transfer": {"kind": "preset", "preset": kind}, "camera": {"frame": "visible"}}
+    tables: dict[str, Any] = {"transfer": {"kind": "preset", "preset": kind}, "camera": {"frame": "visible", **_facing(volume)}}
     if kind == "labels":
         tables["volume"] = {"interpolation": "nearest"}
     if lit:
@@ -51,6 +53,14 @@ def first_picture(volume: Volume, path: Path, preset: str | None = None, *, lit:
     if not path.is_dir() and not path.name.lower().endswith(ORIENTED):
         notes.append("the file does not say what is up: z is taken for it (--up and --view say otherwise)")
     return FirstPicture(tables, notes)
+
+
+def _facing(volume: Volume) -> dict[str, str]:
+    """The view of a volume that is a slice, or little more: across its thinnest axis."""
+    matrix = np.asarray(volume.world_from_grid, float)[:3, :3] * [n - 1 if n > 1 else 1 for n in volume.shape]
+    lengths = np.abs(matrix).sum(axis=1)
+    thin = int(np.argmin(lengths))
+    return {"view": ("left", "front", "top")[thin]} if lengths[thin] < THIN * np.max(lengths) else {}
 
 
 def what_is_seen(volume: Volume, transfer: AbstractTransfer) -> str | None:

@@ -86,7 +86,8 @@ class Volume(eqx.Module):
     - `world_from_grid`: 4x4 affine, default the identity.
     - `slope`, `intercept`: scalars, default 1 and 0, as DICOM's rescale.
     - `interpolation`: `Trilinear()` (default) or `Nearest()`.
-    - `missing`: the stored number that means "no data", such as -2000; NaN voxels mean that by themselves. A sample that is made of such a
+    - `missing`: the stored number that means "no data", such as -2000; NaN voxels mean that by themselves, and so do, with
+      a warning, those beyond 1e30. A sample that is made of such a
       voxel is empty, and neither the range of values nor gradients know of it: `values` holds what lies around in its place.
     - `unit`: of the data, such as "HU", where that is known; only said.
     - `remainder`: of a `world_from_grid` that JAX holds already: what single precision leaves of one that was given in double precision

@@ -12,6 +12,8 @@ from jvr.model.checks import known
 
 # Bits of `gaps`: the voxel itself is missing; so is a corner of the cell that begins at it.
 VOXEL, CELL = 1, 2
+# Larger numbers are no measurement: files mark missing data with them.
+HUGE = 1e30
 # How far beside data a missing voxel can be part of a gradient.
 REACH = 2
 # Voxels that are so few and lie so far out that they are no part of the range of values.
@@ -71,8 +73,8 @@ def integer_type(values: np.ndarray) -> np.dtype:
 def without_gaps(
     values: Num[Array, "x y z"], missing: float | int | None
 ) -> tuple[Num[Array, "x y z"], UInt8[Array, "x y z"] | None]:
-    """Voxels of which those that are missing, because they equal `missing` or are NaN, are filled in, and where those are (`gaps`), `None`
-    where there are none.
+    """Voxels of which those that are missing, because they equal `missing`, are NaN or lie beyond 1e30, are filled in, and where those
+    are (`gaps`): `None` where there are none.
 
     Near data the mean of what lies around is filled in, so that a gradient sees no step, elsewhere the smallest voxel: the range of values
     stays that of the data. Traced voxels that are NaN stay, since their number would have to be known. **Raises** `ValueError` where every
@@ -83,6 +85,10 @@ def without_gaps(
     if voxels is None or (missing is None and not is_float):
         return values, None
     absent = np.isnan(voxels) if is_float else np.zeros(voxels.shape, bool)
+    if is_float and (count := np.count_nonzero(huge := np.abs(voxels) >= HUGE)):
+        if missing is None or abs(missing) < HUGE:
+            warnings.warn(f"{count:,} voxels lie beyond 1e30: they count as missing data and stay empty", stacklevel=4)
+        absent |= huge
     if missing is not None:
         # Compared as the voxels are stored: a number that their type rounds means the same voxels.
         absent |= voxels == (np.asarray(missing).astype(voxels.dtype) if is_float else missing)

@@ -102,8 +102,8 @@ def read_volume(
       or what the file says.
     - `channel`, `time`: which of several channels (its index from 0 or its name) and points in time (its index).
     - `missing`: the number, in data units, that means "no data"; `False` where none does. Default: what the file says, or a number that
-      scanners and simulations write for it (-2000, -3024, -32768, -9999, ... or beyond 1e30) where it lies far from all others, with a
-      warning. NaN means that by itself. What is missing stays empty.
+      scanners and simulations write for it (-2000, -3024, -32768, -9999, ...) where it lies far from all others, with a warning. NaN
+      and numbers beyond 1e30 mean that by themselves. What is missing stays empty.
     - `nan_value`: number, in data units, that takes the place of NaN and infinite voxels.
 
     **Raises** `VolumeError` (a `ValueError`) with one line that names the file, what is wrong and what would be right, for

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
 # What CT scanners write outside of the circle that they reconstruct (as stored, and in HU), and others where there is nothing.
 PADDING = (-2000.0, -3024.0, -32768.0, -9999.0, -99999.0, -999999.0, -2147483648.0)
-# Larger numbers of a float volume that are all the same are no measurement.
-HUGE = 1e30
 # By how much of its own size a padding is set apart from the smallest voxel beside it.
 APART = 0.1
 
@@ -54,18 +52,9 @@ def _count(path: Path, kept: np.ndarray, number: float) -> int:
 
 
 def _guessed(stored: "Stored", kept: np.ndarray) -> float | None:
-    """A number at the end of the values that is known to be a padding, and far from the next."""
-    with np.errstate(invalid="ignore"):
-        ends = [float(np.nanmin(kept)), float(np.nanmax(kept))]
-    for number in ends:
-        data = stored.slope * number + stored.intercept
-        if kept.dtype.kind == "f" and abs(number) >= HUGE:
-            if np.count_nonzero(np.abs(kept) >= HUGE) == np.count_nonzero(kept == kept.dtype.type(number)):
-                return number
-            continue
-        if number != ends[0] or not (number in PADDING or round(data, 3) in PADDING):
-            continue
-        others = kept[kept > number]
-        if others.size and float(others.min()) - number > APART * abs(number):
-            return number
-    return None
+    """The smallest number where it is known to be a padding, and far from the next."""
+    number = float(np.nanmin(kept))
+    if number not in PADDING and round(stored.slope * number + stored.intercept, 3) not in PADDING:
+        return None
+    others = kept[kept > number]
+    return number if others.size and float(others.min()) - number > APART * abs(number) else None
