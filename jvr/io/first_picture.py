@@ -6,9 +6,11 @@ What is guessed is said in a line each: `FirstPicture.notes`.
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jvr.io.config.transfers import LABEL_DEPTH, contents
 from jvr.model.transfer import AbstractTransfer
@@ -53,6 +55,12 @@ def first_picture(volume: Volume, path: Path, preset: str | None = None, *, lit:
     if not path.is_dir() and not path.name.lower().endswith(ORIENTED):
         notes.append("the file does not say what is up: z is taken for it (--up and --view say otherwise)")
     return FirstPicture(tables, notes)
+
+
+@eqx.filter_jit
+def _share_seen(transfer: AbstractTransfer, data: Float[Array, "n"]) -> Float[Array, ""]:
+    seen = lambda s: jnp.max(jnp.asarray(transfer.evaluate(s, jnp.zeros_like(s)).sigma_t)) > 0
+    return jnp.mean(jax.vmap(seen)(data))
 
 
 def _facing(volume: Volume) -> dict[str, str]:

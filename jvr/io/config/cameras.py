@@ -2,6 +2,7 @@
 
 import itertools
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -68,7 +69,7 @@ def _visible_corners(volume: Volume, transfer: AbstractTransfer) -> np.ndarray:
     """World positions of the corners of all visible bricks, `(n, 3)`."""
     bricks = volume.bricks if volume.bricks is not None else volume.bricked().bricks
     assert bricks is not None
-    reach = np.asarray(occupancy_of(bricks, volume.slope, volume.intercept, transfer).reach)
+    reach = np.asarray(eqx.filter_jit(occupancy_of)(bricks, volume.slope, volume.intercept, transfer).reach)
     if volume.gaps is not None:
         reach = np.where(_without_data(volume, bricks.size), 1, reach)
     first = np.argwhere(reach == 0)[:, None] * bricks.size
