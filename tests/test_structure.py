@@ -33,6 +33,9 @@ HEAVY = (
     "rich",
     "pydantic",
     "tifffile",
+    "imagecodecs",
+    "PIL",
+    "zarr",
 )
 
 

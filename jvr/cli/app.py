@@ -19,6 +19,12 @@ Json = Annotated[bool, typer.Option("--json", help="Print one machine-readable o
 Shape = Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Voxels of a headerless file.")]
 Dtype = Annotated[str | None, typer.Option(help="NumPy type of a headerless file, such as uint8 or >i2.")]
 Spacing = Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Millimetres between voxels, in place of the file's.")]
+Origin = Annotated[
+    str | None, typer.Option(metavar="X,Y,Z", help="Position of the first voxel in millimetres, in place of the file's.")
+]
+Axes = Annotated[str | None, typer.Option(help="Names of the axes of a .npy, .tif or .zarr, such as zyx or tczyx.")]
+Channel = Annotated[str | None, typer.Option(help="Which of several channels: its index from 0, or its name.")]
+Time = Annotated[int | None, typer.Option("--time", min=0, help="Which of several points in time: its index from 0.")]
 NanValue = Annotated[float | None, typer.Option(help="Number that takes the place of NaN and infinite voxels.")]
 Input = Annotated[Path, typer.Argument(metavar="CONFIG|VOLUME", help="A configuration (.toml) or a volume file.")]
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="A configuration (.toml).")]
@@ -40,6 +46,10 @@ def render(
     shape: Shape = None,
     dtype: Dtype = None,
     spacing: Spacing = None,
+    origin: Origin = None,
+    axes: Axes = None,
+    channel: Channel = None,
+    time: Time = None,
     nan_value: NanValue = None,
     as_json: Json = False,
 ) -> None:
@@ -50,7 +60,8 @@ def render(
     with reading():
         check_image_output(output)
         transfer = None if preset is None else {"kind": "preset", "preset": preset}
-        config = load(given, [*(sets or [])], _raw_keywords(shape, dtype, spacing, nan_value), transfer)
+        volume = _given(shape, spacing, origin, dtype=dtype, axes=axes, channel=channel, time=time, nan_value=nan_value)
+        config = load(given, [*(sets or [])], volume, transfer)
         if given.suffix.lower() == ".toml" or size is not None:
             config = _sized(config, size)
     report = render_pictures(config, output)
@@ -156,12 +167,16 @@ def plan(
 
 @app.command(epilog=_examples("jvr info head.nii.gz", "jvr info embryo.raw --shape 256,256,256 --dtype uint8 --json"))
 def info(
-    volume: Annotated[Path, typer.Argument(metavar="VOLUME", help="A volume file, or a folder of DICOM slices.")],
+    volume: Annotated[Path, typer.Argument(metavar="VOLUME", help="A volume file, or a folder of slices.")],
     shape: Shape = None,
     dtype: Dtype = None,
     spacing: Spacing = None,
+    origin: Origin = None,
+    axes: Axes = None,
+    channel: Channel = None,
+    time: Time = None,
     nan_value: NanValue = None,
-    array: Annotated[str | None, typer.Option(help="Which array of a .vtk, .vti or .zarr.")] = None,
+    array: Annotated[str | None, typer.Option(help="Which array of a .vtk, .vti or .zarr, or image of a .tif.")] = None,
     series: Annotated[str | None, typer.Option(help="Which series of a DICOM folder.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -170,8 +185,9 @@ def info(
         from jvr.io.describe import describe, format_description
         from jvr.io.volumes import read_volume
 
-        keywords = _raw_keywords(shape, dtype, spacing, nan_value)
-        found = describe(read_volume(volume, array=array, series=series, **keywords), volume)
+        choice = {"array": array, "series": series, "axes": axes, "channel": channel, "time": time}
+        keywords = _given(shape, spacing, origin, dtype=dtype, nan_value=nan_value, **choice)
+        found = describe(read_volume(volume, **keywords), volume)
     _print(found, as_json, format_description(found))
 
 
@@ -191,22 +207,24 @@ def demo(
     _print(report, as_json, _summary(report, output))
 
 
-def _raw_keywords(shape: str | None, dtype: str | None, spacing: str | None, nan_value: float | None) -> dict[str, Any]:
+def _given(shape: str | None, spacing: str | None, origin: str | None, **others: Any) -> dict[str, Any]:
     """Keywords of a volume from flags."""
-    given = {"shape": _triple(shape, "--shape", int), "dtype": dtype, "spacing": _triple(spacing, "--spacing", float)}
-    return {name: value for name, value in (given | {"nan_value": nan_value}).items() if value is not None}
+    triples = {"shape": _triple(shape, "--shape", int), "spacing": _triple(spacing, "--spacing", float)}
+    triples["origin"] = _triple(origin, "--origin", float, positive=False)
+    return {name: value for name, value in (triples | others).items() if value is not None}
 
 
-def _triple(text: str | None, flag: str, kind: type) -> list[Any] | None:
+def _triple(text: str | None, flag: str, kind: type, *, positive: bool = True) -> list[Any] | None:
     if text is None:
         return None
     try:
         numbers = [kind(part) for part in text.replace("x", ",").split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) != 3 or min(numbers) <= 0:
+    if len(numbers) != 3 or (positive and min(numbers) <= 0):
         what = "whole numbers of voxels" if kind is int else "numbers of millimetres"
-        raise BadInput(f"{flag} {text}: must be three positive {what} along x, y, z, such as 256,256,128")
+        example = "256,256,128" if positive else "-120,-120,40.5"
+        raise BadInput(f"{flag} {text}: must be three {'positive ' if positive else ''}{what} along x, y, z, such as {example}")
     return numbers
 
 

@@ -35,7 +35,8 @@ ADJOINTS = {"replay": Replay, "forward": Forward, "rows": Rows}
 ORACLES = {"local-error": LocalError, "opacity-change": OpacityChange, "brick-range": BrickRange}
 INTERPOLATIONS = {"trilinear": Trilinear, "nearest": Nearest}
 OPTICAL = {"emission-absorption": EmissionAbsorption, "emission-only": EmissionOnly, "absorption-only": AbsorptionOnly}
-READ_KEYWORDS = ("shape", "dtype", "spacing", "origin", "array", "series", "axes", "nan_value")
+READ_KEYWORDS = ("shape", "dtype", "spacing", "origin", "direction", "slope", "intercept")
+READ_KEYWORDS += ("array", "series", "axes", "channel", "time", "nan_value")
 
 
 class FitJob(NamedTuple):

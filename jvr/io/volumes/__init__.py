@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jvr.io.volumes.arrays import read_npy, read_raw, read_zarr
+from jvr.io.volumes.arrays import read_npy, read_raw
 from jvr.io.volumes.dicom import read_dicom_file, read_dicom_folder
 from jvr.io.volumes.errors import VolumeError, first_bytes
 from jvr.io.volumes.given import Given
@@ -20,10 +20,12 @@ from jvr.io.volumes.metaimage import read_metaimage
 from jvr.io.volumes.nifti import read_nifti
 from jvr.io.volumes.nrrd import read_nrrd
 from jvr.io.volumes.slc import read_slc
+from jvr.io.volumes.slices import is_slices, read_slices
 from jvr.io.volumes.stored import Stored, replaced, to_volume
 from jvr.io.volumes.tiff import read_tiff
 from jvr.io.volumes.vtk_legacy import read_legacy_vtk
 from jvr.io.volumes.vtk_xml import read_vti
+from jvr.io.volumes.zarr_files import is_zarr, read_zarr
 from jvr.model.volume import Volume
 
 __all__ = ["VolumeError", "read_volume"]
@@ -47,17 +49,19 @@ READERS: dict[str, tuple[Callable[[Path, Given], Stored], tuple[str, ...]]] = {
     ".vtk": (read_legacy_vtk, ("array", "channel")),
     ".vti": (read_vti, ("array", "channel")),
     ".slc": (read_slc, ()),
-    ".tif": (read_tiff, ()),
-    ".tiff": (read_tiff, ()),
-    ".npy": (read_npy, ("axes",)),
-    ".zarr": (read_zarr, ("array", "axes")),
+    ".tif": (read_tiff, ("array", "axes", "channel", "time")),
+    ".tiff": (read_tiff, ("array", "axes", "channel", "time")),
+    ".npy": (read_npy, ("axes", "channel", "time")),
+    ".zarr": (read_zarr, ("array", "axes", "channel", "time")),
+    ".zarr.zip": (read_zarr, ("array", "axes", "channel", "time")),
+    ".ozx": (read_zarr, ("array", "axes", "channel", "time")),
 } | {ending: (read_raw, ("shape", "dtype")) for ending in RAW}
 MEANING = {
     "shape": "shape= and dtype= describe headerless raw files, this file has a header",
     "dtype": "shape= and dtype= describe headerless raw files, this file has a header",
-    "array": "array= names an array in a .vtk, .vti or .zarr, this file holds a single one",
+    "array": "array= names an array in a .vtk, .vti, .zarr or an image of a .tif, this file holds a single one",
     "series": "series= chooses among the DICOM series of a folder",
-    "axes": "axes= orders the axes of .npy and .zarr, this format defines its own",
+    "axes": "axes= names the axes of .npy, .tif and .zarr, this format defines its own",
     "channel": "channel= chooses one of several channels, this format has none",
     "time": "time= chooses one of several points in time, this format has none",
 }
@@ -83,8 +87,9 @@ def read_volume(
     """Reads a scalar volume and where it lies in the world (millimetres, LPS, as ITK reads it).
 
     Formats: MetaImage (.mhd, .mha), NRRD (.nrrd, .nhdr), NIfTI (.nii, .nii.gz), a folder of DICOM slices or one .dcm,
-    legacy VTK structured points (.vtk), VTK image data (.vti), TIFF stacks (.tif, .tiff), NumPy (.npy, never unpickled),
-    Zarr (.zarr) and headerless raw (.raw, .bin, .dat, or any ending where `shape` and `dtype` are given).
+    legacy VTK structured points (.vtk), VTK image data (.vti), TIFF, ImageJ and OME-TIFF (.tif, .tiff), a folder of PNG, TIFF, BMP
+    or JPEG slices, NumPy (.npy, never unpickled), Zarr and OME-Zarr (.zarr, .zarr.zip, .ozx) and headerless
+    raw (.raw, .bin, .dat, or any ending where `shape` and `dtype` are given).
 
     Integer voxels stay integers (32 and 64-bit ones as narrow as their values fit), floats become float32 unless x64 is
     on. A file's slope and intercept become those of the `Volume`, or are applied where its reader does so (DICOM).
@@ -98,9 +103,10 @@ def read_volume(
     - `origin`: world position of voxel (0, 0, 0) in mm, in place of what the file says (default 0, 0, 0).
     - `direction`: 3x3, unit vectors along x, y, z of the grid in its columns, in place of what the file says.
     - `slope`, `intercept`: data units are `slope * stored + intercept`, in place of what the file says.
-    - `array`: which array of a VTK file or Zarr group.
+    - `array`: which array of a VTK file or Zarr group, or image of a TIFF.
     - `series`: which DICOM series of a folder, by its id.
-    - `axes`: the order of a NumPy or Zarr array's axes, such as "zyx"; default "xyz", or what a Zarr's metadata say.
+    - `axes`: names of a NumPy, TIFF or Zarr array's axes in their order, such as "zyx", or "tczyx" with channel and time; default "xyz",
+      or what the file says.
     - `channel`, `time`: which of several channels (its index from 0 or its name) and points in time (its index).
     - `nan_value`: number, in data units, that takes the place of NaN and infinite voxels.
 
@@ -168,8 +174,9 @@ def _reader(path: Path, *, raw: bool) -> tuple[Callable[[Path, Given], Stored], 
     endings = ("".join(path.suffixes[-2:]).lower(), path.suffix.lower())
     ending = next((ending for ending in endings if ending in READERS), None)
     if path.is_dir():
-        is_zarr = ending == ".zarr" or any((path / marker).exists() for marker in ("zarr.json", ".zarray", ".zgroup"))
-        return READERS[".zarr"] if is_zarr else (read_dicom_folder, ("series",))
+        if ending == ".zarr" or is_zarr(path):
+            return READERS[".zarr"]
+        return (read_slices, ()) if is_slices(path) else (read_dicom_folder, ("series",))
     first_bytes(path, 1)
     if ending == ".zarr":
         raise VolumeError(path, "a Zarr is a folder, this is a file; unpack it first")
@@ -180,5 +187,5 @@ def _reader(path: Path, *, raw: bool) -> tuple[Callable[[Path, Given], Stored], 
         return read_raw, ("shape", "dtype")
     shown = "".join(path.suffixes[-2:]) if name.endswith(".gz") else path.suffix
     known = ", ".join(ending for ending in READERS)
-    problem = f"unsupported extension '{shown}'; supported: {known}, a folder of DICOM slices"
+    problem = f"unsupported extension '{shown}'; supported: {known}, a folder of DICOM, PNG, TIFF, BMP or JPEG slices"
     raise VolumeError(path, f"{problem}, and headerless data of any extension with shape= and dtype=")

@@ -22,9 +22,14 @@ class VolumeTable(Table):
     dtype: str | None = None
     spacing: Annotated[list[float], numbers(3, "mm along x, y, z", 0.0, inner=True)] | None = None
     origin: Position | None = None
+    direction: Annotated[list[Position], Field(min_length=3, max_length=3)] | None = None
+    slope: Scalar | None = None
+    intercept: Scalar | None = None
     array: str | None = None
     series: str | None = None
     axes: str | None = None
+    channel: Annotated[int, whole("index of a channel", 0)] | str | None = None
+    time: Annotated[int, whole("index of a point in time", 0)] | None = None
     nan_value: Scalar | None = None
     interpolation: Literal["trilinear", "nearest"] = "trilinear"
     scale: Range | None = None
