@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test test-all check clean
 
 demo: $(VENV)/installed
-	$(BIN)/jvr demo -o jvr-demo
+	$(BIN)/jvr demo -o jvr-demo --force
 
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile

@@ -23,8 +23,8 @@ import jvr
 from experiments.accuracy_vs_time import machine
 from experiments.protocols import DATA, HEAD
 from jvr.io.config import build_cameras, build_scene, build_settings, read_config
-from jvr.io.images import srgb_from_linear
 from jvr.parallel import in_threads
+from jvr.pictures import srgb_from_linear
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 COLUMNS = 6

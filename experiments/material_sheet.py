@@ -20,8 +20,8 @@ import jvr
 from experiments.protocols import DATA, HEAD
 from jvr.io.config import build_cameras, build_scene, build_settings, read_config
 from jvr.io.environment import read_environment
-from jvr.io.images import srgb_from_linear
 from jvr.model.harmonics.projection import map_directions
+from jvr.pictures import srgb_from_linear
 
 CONFIG = Path(__file__).parents[1] / "configs" / "real" / "ct_head_lit.toml"
 PROBES = ("kiara_1_dawn_1k.hdr", "potsdamer_platz_1k.hdr", "studio_small_03_1k.hdr", "StageEnvLatLong.exr")

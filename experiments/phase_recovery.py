@@ -214,7 +214,7 @@ def figure(one: Found, lobes: Found, truths: Sequence[np.ndarray], views: View, 
     """The pictures of the first run, how the unknowns of both came to their values, and the lobes that were found."""
     from matplotlib.figure import Figure
 
-    from jvr.io.images import srgb_from_linear
+    from jvr.pictures import srgb_from_linear
 
     drawing = Figure(figsize=(11, 5.2), layout="constrained")
     above, below = drawing.subfigures(2, 1, height_ratios=[1, 1.7], squeeze=False).ravel()

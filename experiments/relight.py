@@ -29,8 +29,8 @@ from experiments.accuracy_vs_time import machine
 from experiments.protocols import DATA, HEAD
 from jvr.io.config import build_scene, read_config
 from jvr.io.environment import read_environment
-from jvr.io.images import srgb_from_linear
 from jvr.model.harmonics.projection import map_directions
+from jvr.pictures import srgb_from_linear
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 LIGHTS = ("potsdamer_platz_1k", "studio_small_03_1k")

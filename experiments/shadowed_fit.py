@@ -99,7 +99,7 @@ def figure(pictures: dict[str, list[np.ndarray]], transfers: dict[str, Any], pat
     """A row of pictures for each model, and the extinctions and colours that were found."""
     from matplotlib.figure import Figure
 
-    from jvr.io.images import srgb_from_linear
+    from jvr.pictures import srgb_from_linear
 
     drawing = Figure(figsize=(11, 7), layout="constrained")
     left, right = drawing.subfigures(1, 2, width_ratios=[1.25, 1], squeeze=False).ravel()

@@ -3,58 +3,6 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jvr.march.differentiation import Forward as Forward
-from jvr.march.differentiation import Replay as Replay
-from jvr.march.differentiation import Rows as Rows
-from jvr.march.oracle import BrickRange as BrickRange
-from jvr.march.oracle import Finest as Finest
-from jvr.march.oracle import LocalError as LocalError
-from jvr.march.oracle import OpacityChange as OpacityChange
-from jvr.march.quadrature import Midpoint as Midpoint
-from jvr.march.quadrature import PreIntegrated as PreIntegrated
-from jvr.model import harmonics
-from jvr.model import presets as presets
-from jvr.model.by_value import ByValue as ByValue
-from jvr.model.camera import OrthographicCamera as OrthographicCamera
-from jvr.model.camera import PerspectiveCamera as PerspectiveCamera
-from jvr.model.camera import fibonacci_sphere as fibonacci_sphere
-from jvr.model.camera import orbit as orbit
-from jvr.model.environment import EnvironmentLight as EnvironmentLight
-from jvr.model.gradient_transfer import GradientOpacity as GradientOpacity
-from jvr.model.gradient_transfer import GradientTransfer as GradientTransfer
-from jvr.model.light import AmbientLight as AmbientLight
-from jvr.model.light import DirectionalLight as DirectionalLight
-from jvr.model.light import HeadLight as HeadLight
-from jvr.model.light import PointLight as PointLight
-from jvr.model.light import SpotLight as SpotLight
-from jvr.model.light import disc_light as disc_light
-from jvr.model.light import sphere_light as sphere_light
-from jvr.model.normals import AnalyticGradient as AnalyticGradient
-from jvr.model.normals import CentralDifferences as CentralDifferences
-from jvr.model.normals import ForwardDifferences as ForwardDifferences
-from jvr.model.normals import PrecomputedGradient as PrecomputedGradient
-from jvr.model.normals import SobelDifferences as SobelDifferences
-from jvr.model.optical import AbsorptionOnly as AbsorptionOnly
-from jvr.model.optical import EmissionAbsorption as EmissionAbsorption
-from jvr.model.optical import EmissionOnly as EmissionOnly
-from jvr.model.scene import Scene as Scene
-from jvr.model.transfer import GaussianTransfer as GaussianTransfer
-from jvr.model.transfer import LinearTransfer as LinearTransfer
-from jvr.model.transfer import LutTransfer as LutTransfer
-from jvr.model.volume import ClippingBox as ClippingBox
-from jvr.model.volume import Nearest as Nearest
-from jvr.model.volume import Trilinear as Trilinear
-from jvr.model.volume import Volume as Volume
-from jvr.rendering.image import Rendering as Rendering
-from jvr.rendering.image import RenderStats as RenderStats
-from jvr.rendering.image import render as render
-from jvr.rendering.plan import plan as plan
-from jvr.rendering.sampling import Refinement as Refinement
-from jvr.rendering.sampling import Slices as Slices
-from jvr.rendering.sampling import Uniform as Uniform
-from jvr.rendering.settings import Settings as Settings
-from jvr.types import Outcome as Outcome
-
 if TYPE_CHECKING:
     from jvr.effects.deep_shadow_map import DeepShadowMap as DeepShadowMap
     from jvr.effects.radiance_transfer import MaterialBleeding as MaterialBleeding
@@ -89,13 +37,40 @@ if TYPE_CHECKING:
     from jvr.fitting.transforms import Ordered as Ordered
     from jvr.fitting.transforms import Sigmoid as Sigmoid
     from jvr.fitting.transforms import Softplus as Softplus
+    from jvr.io.images import read_image as read_image
     from jvr.io.precompute import precompute as precompute
     from jvr.io.volumes import read_volume as read_volume
+    from jvr.march.differentiation import Forward as Forward
+    from jvr.march.differentiation import Replay as Replay
+    from jvr.march.differentiation import Rows as Rows
+    from jvr.march.oracle import BrickRange as BrickRange
+    from jvr.march.oracle import Finest as Finest
+    from jvr.march.oracle import LocalError as LocalError
+    from jvr.march.oracle import OpacityChange as OpacityChange
+    from jvr.march.quadrature import Midpoint as Midpoint
+    from jvr.march.quadrature import PreIntegrated as PreIntegrated
+    from jvr.model import harmonics as harmonics
+    from jvr.model import presets as presets
     from jvr.model.brdf import BlinnPhongBRDF as BlinnPhongBRDF
     from jvr.model.brdf import LambertBRDF as LambertBRDF
     from jvr.model.brdf import PhaseBRDF as PhaseBRDF
     from jvr.model.brdf import PhongBRDF as PhongBRDF
+    from jvr.model.by_value import ByValue as ByValue
+    from jvr.model.camera import OrthographicCamera as OrthographicCamera
+    from jvr.model.camera import PerspectiveCamera as PerspectiveCamera
+    from jvr.model.camera import fibonacci_sphere as fibonacci_sphere
+    from jvr.model.camera import orbit as orbit
     from jvr.model.dipole import Dipole as Dipole
+    from jvr.model.environment import EnvironmentLight as EnvironmentLight
+    from jvr.model.gradient_transfer import GradientOpacity as GradientOpacity
+    from jvr.model.gradient_transfer import GradientTransfer as GradientTransfer
+    from jvr.model.light import AmbientLight as AmbientLight
+    from jvr.model.light import DirectionalLight as DirectionalLight
+    from jvr.model.light import HeadLight as HeadLight
+    from jvr.model.light import PointLight as PointLight
+    from jvr.model.light import SpotLight as SpotLight
+    from jvr.model.light import disc_light as disc_light
+    from jvr.model.light import sphere_light as sphere_light
     from jvr.model.material import HarmonicMaterial as HarmonicMaterial
     from jvr.model.material import MaterialByValue as MaterialByValue
     from jvr.model.merl import MerlBRDF as MerlBRDF
@@ -103,68 +78,129 @@ if TYPE_CHECKING:
     from jvr.model.mie import Draine as Draine
     from jvr.model.mie import JendersieEon as JendersieEon
     from jvr.model.mie import TabulatedPhase as TabulatedPhase
+    from jvr.model.normals import AnalyticGradient as AnalyticGradient
+    from jvr.model.normals import CentralDifferences as CentralDifferences
+    from jvr.model.normals import ForwardDifferences as ForwardDifferences
+    from jvr.model.normals import PrecomputedGradient as PrecomputedGradient
+    from jvr.model.normals import SobelDifferences as SobelDifferences
+    from jvr.model.optical import AbsorptionOnly as AbsorptionOnly
+    from jvr.model.optical import EmissionAbsorption as EmissionAbsorption
+    from jvr.model.optical import EmissionOnly as EmissionOnly
     from jvr.model.phase import DoubleHenyeyGreenstein as DoubleHenyeyGreenstein
     from jvr.model.phase import HenyeyGreenstein as HenyeyGreenstein
     from jvr.model.phase import Isotropic as Isotropic
     from jvr.model.phase import Mixture as Mixture
     from jvr.model.phase import Rayleigh as Rayleigh
     from jvr.model.phase import Schlick as Schlick
+    from jvr.model.scene import Scene as Scene
+    from jvr.model.transfer import GaussianTransfer as GaussianTransfer
+    from jvr.model.transfer import LinearTransfer as LinearTransfer
+    from jvr.model.transfer import LutTransfer as LutTransfer
+    from jvr.model.volume import ClippingBox as ClippingBox
+    from jvr.model.volume import Nearest as Nearest
+    from jvr.model.volume import Trilinear as Trilinear
+    from jvr.model.volume import Volume as Volume
+    from jvr.pictures import linear_from_srgb as linear_from_srgb
+    from jvr.pictures import srgb_from_linear as srgb_from_linear
+    from jvr.pictures import write_image as write_image
     from jvr.rendering.advise import Advice as Advice
     from jvr.rendering.advise import advise as advise
+    from jvr.rendering.image import Rendering as Rendering
+    from jvr.rendering.image import RenderStats as RenderStats
+    from jvr.rendering.image import render as render
     from jvr.rendering.measure import Measurement as Measurement
     from jvr.rendering.measure import measure as measure
+    from jvr.rendering.plan import plan as plan
+    from jvr.rendering.sampling import Refinement as Refinement
+    from jvr.rendering.sampling import Slices as Slices
+    from jvr.rendering.sampling import Uniform as Uniform
+    from jvr.rendering.settings import Settings as Settings
     from jvr.rendering.tune import Tuned as Tuned
     from jvr.rendering.tune import tune as tune
+    from jvr.types import Outcome as Outcome
 
-sh = harmonics
+    sh = harmonics
+
 __version__ = "0.1.0"
 
-# Fitting alone takes longer to import than JAX, so it and the readers are imported by their first use; so are effects, of which
-# a scene without them needs none.
-_LATE = {
+# Everything is imported by its first use: JAX alone takes a second, fitting another, and a scene needs few of the effects. So the command
+# line answers a wrong flag at once, and no moment of its start is outside of what catches Ctrl-C.
+_MODULES = {"harmonics": "jvr.model.harmonics", "presets": "jvr.model.presets", "sh": "jvr.model.harmonics"}
+_NAMES = {
+    "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
     "jvr.effects.radiance_transfer": ("MaterialBleeding", "RadianceTransfer", "TransferBleeding"),
     "jvr.effects.scattering": ("SingleScattering",),
     "jvr.effects.shading": ("BlinnPhong", "Lambert", "Phong"),
-    "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
     "jvr.effects.shadow_map": ("ShadowMap",),
     "jvr.effects.shadow_rays": ("ShadowRays",),
     "jvr.effects.shadow_volume": ("OpacityShadowMap", "ShadowVolume"),
     "jvr.fitting.fit": ("FitResult", "fit"),
     "jvr.fitting.initialise": ("colours_given_extinction", "flat_transfer"),
+    "jvr.fitting.least_squares": ("Dogleg", "GaussNewton", "LevenbergMarquardt"),
     "jvr.fitting.losses": (
-        "DSSIM",
         "AbsoluteError",
         "ColourSmoothness",
+        "DSSIM",
         "ExtinctionSmoothness",
         "Huber",
         "Sparsity",
         "SquaredError",
     ),
-    "jvr.fitting.residuals": ("residuals",),
-    "jvr.fitting.least_squares": ("Dogleg", "GaussNewton", "LevenbergMarquardt"),
     "jvr.fitting.minimisers": ("LBFGSB",),
+    "jvr.fitting.residuals": ("residuals",),
     "jvr.fitting.transforms": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
+    "jvr.io.images": ("read_image",),
     "jvr.io.precompute": ("precompute",),
     "jvr.io.volumes": ("read_volume",),
-    "jvr.model.material": ("HarmonicMaterial", "MaterialByValue"),
+    "jvr.march.differentiation": ("Forward", "Replay", "Rows"),
+    "jvr.march.oracle": ("BrickRange", "Finest", "LocalError", "OpacityChange"),
+    "jvr.march.quadrature": ("Midpoint", "PreIntegrated"),
     "jvr.model.brdf": ("BlinnPhongBRDF", "LambertBRDF", "PhaseBRDF", "PhongBRDF"),
+    "jvr.model.by_value": ("ByValue",),
+    "jvr.model.camera": ("OrthographicCamera", "PerspectiveCamera", "fibonacci_sphere", "orbit"),
     "jvr.model.dipole": ("Dipole",),
+    "jvr.model.environment": ("EnvironmentLight",),
+    "jvr.model.gradient_transfer": ("GradientOpacity", "GradientTransfer"),
+    "jvr.model.light": ("AmbientLight", "DirectionalLight", "HeadLight", "PointLight", "SpotLight", "disc_light", "sphere_light"),
+    "jvr.model.material": ("HarmonicMaterial", "MaterialByValue"),
     "jvr.model.merl": ("MerlBRDF",),
     "jvr.model.microfacet": ("MicrofacetBRDF",),
     "jvr.model.mie": ("Draine", "JendersieEon", "TabulatedPhase"),
+    "jvr.model.normals": (
+        "AnalyticGradient",
+        "CentralDifferences",
+        "ForwardDifferences",
+        "PrecomputedGradient",
+        "SobelDifferences",
+    ),
+    "jvr.model.optical": ("AbsorptionOnly", "EmissionAbsorption", "EmissionOnly"),
     "jvr.model.phase": ("DoubleHenyeyGreenstein", "HenyeyGreenstein", "Isotropic", "Mixture", "Rayleigh", "Schlick"),
+    "jvr.model.scene": ("Scene",),
+    "jvr.model.transfer": ("GaussianTransfer", "LinearTransfer", "LutTransfer"),
+    "jvr.model.volume": ("ClippingBox", "Nearest", "Trilinear", "Volume"),
+    "jvr.pictures": ("linear_from_srgb", "srgb_from_linear", "write_image"),
     "jvr.rendering.advise": ("Advice", "advise"),
+    "jvr.rendering.image": ("RenderStats", "Rendering", "render"),
     "jvr.rendering.measure": ("Measurement", "measure"),
+    "jvr.rendering.plan": ("plan",),
+    "jvr.rendering.sampling": ("Refinement", "Slices", "Uniform"),
+    "jvr.rendering.settings": ("Settings",),
     "jvr.rendering.tune": ("Tuned", "tune"),
+    "jvr.types": ("Outcome",),
 }
-_MODULE_OF = {name: module for module, names in _LATE.items() for name in names}
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
+    if name in _MODULES:
+        found = importlib.import_module(_MODULES[name])
+    elif name in _MODULE_OF:
+        found = getattr(importlib.import_module(_MODULE_OF[name]), name)
+    else:
         raise AttributeError(f"module 'jvr' has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULE_OF[name]), name)
+    globals()[name] = found
+    return found
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_MODULE_OF])
+    return sorted({*globals(), *_MODULES, *_MODULE_OF})

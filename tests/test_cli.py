@@ -212,7 +212,7 @@ def test_an_interrupted_fit_goes_on_to_the_same_answer(tmp_path, capfd, monkeypa
             raise KeyboardInterrupt
 
     monkeypatch.setattr("jvr.fitting.checkpoint.save", interrupted)
-    assert cli.run(["fit", "fit.toml", "-o", "halves"]) == 1
+    assert cli.run(["fit", "fit.toml", "-o", "halves"]) == 130
     printed = capfd.readouterr().err
     assert printed.count("\n") == 1
     assert "checkpoint.npz is kept" in printed
@@ -229,7 +229,7 @@ def test_an_interrupted_fit_goes_on_to_the_same_answer(tmp_path, capfd, monkeypa
     _folder_of_a_fit(tmp_path / "whole", whole)
     before = snapshot(tmp_path)
     assert cli.run(["fit", "fit.toml", "-o", "whole", "--resume", "--set", "settings.step=0.9"]) == 2
-    assert "checkpoint.npz: written by a fit of another scene" in capfd.readouterr().err
+    assert "checkpoint.npz: is of another fit (settings changed since)" in capfd.readouterr().err
     assert snapshot(tmp_path) == before
 
 

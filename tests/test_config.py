@@ -277,10 +277,11 @@ def random_transfers():
     rng = np.random.default_rng(0)
     exact = lambda *shape: rng.random(shape, np.float32) * np.float32(10.0) ** rng.integers(-8, 8, shape).astype(np.float32)
     grey, coloured = exact(40), exact(40, 3)
+    colours = lambda n: np.minimum(exact(n, 3), 100)
     positions = np.unique(exact(60))[:40]
-    yield jvr.LinearTransfer(positions, exact(40, 3), grey)
-    yield jvr.LutTransfer(exact(40, 3), coloured, [-1024.7, 3071.3])
-    yield jvr.GaussianTransfer(exact(5), exact(5) + np.float32(1e-9), exact(5, 3), exact(5, 3))
+    yield jvr.LinearTransfer(positions, colours(40), grey)
+    yield jvr.LutTransfer(colours(40), coloured, [-1024.7, 3071.3])
+    yield jvr.GaussianTransfer(exact(5), exact(5) + np.float32(1e-9), exact(5, 3), colours(5))
 
 
 @pytest.mark.parametrize("transfer", list(random_transfers()), ids=lambda t: type(t).__name__)

@@ -11,7 +11,7 @@ from test_config_light import BASE, config, refusal, same, scene_of
 
 import jvr
 from jvr.io.config import build_fit, build_scene, read_config
-from jvr.io.images import write_image
+from jvr.pictures import write_image
 
 NATURAL = 'environment = "constant"\nmaterial = "lambert"\n' + BASE
 DISC = "{kind='disc',towards=[0,0,1],half_angle=20}"

@@ -6,7 +6,8 @@ import OpenImageIO
 import pytest
 
 from jvr.io.environment import read_environment
-from jvr.io.images import ImageError, read_image, write_image
+from jvr.io.images import read_image
+from jvr.pictures import ImageError, write_image
 
 HEADER = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n"
 

@@ -11,7 +11,9 @@ import pytest
 import SimpleITK as sitk
 from PIL import Image
 
-from jvr.io.images import ImageError, linear_from_srgb, read_image, replacing, srgb_from_linear, write_image
+from jvr.atomic import replacing
+from jvr.io.images import read_image
+from jvr.pictures import ImageError, linear_from_srgb, srgb_from_linear, write_image
 
 SHAPE = (9, 7)
 

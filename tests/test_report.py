@@ -9,7 +9,7 @@ import pytest
 
 import jvr
 from jvr.fitting.fit import FitResult, FitStats, Iteration
-from jvr.io.images import srgb_from_linear
+from jvr.pictures import srgb_from_linear
 from jvr.report.errors import field_errors
 from jvr.report.page import write_fit_page
 from jvr.report.page.words import with_error, worst_in_words

@@ -14,7 +14,21 @@ import jvr
 
 PACKAGE = Path(jvr.__file__).parent
 # A module imports from modules before it.
-ORDER = ("types", "numerics", "parallel", "model", "march", "effects", "rendering", "fitting", "io", "report", "cli")
+ORDER = (
+    "types",
+    "numerics",
+    "parallel",
+    "atomic",
+    "pictures",
+    "model",
+    "march",
+    "effects",
+    "rendering",
+    "fitting",
+    "io",
+    "report",
+    "cli",
+)
 # A constructor that reads a file imports its reader when it is called: the one thing that `model` takes from `io`.
 READERS = {
     ("jvr.model.merl", "jvr.io.merl"),

@@ -7,15 +7,27 @@ from typing import Annotated, Any
 import typer
 
 from jvr.cli.beforehand import lines_of
-from jvr.cli.inputs import BadInput, check_file_output, check_folder_output, check_image_output, load, reading
+from jvr.cli.inputs import (
+    BadInput,
+    check_file_output,
+    check_folder_output,
+    check_image_output,
+    check_inputs_stay,
+    inputs_of,
+    load,
+    name_of,
+    reading,
+)
 
 HELP = "Differentiable volume rendering: pictures of scalar volumes, and transfer functions from pictures."
-app = typer.Typer(help=HELP, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
+# Without markup, which would take the names of tables in brackets for its own.
+app = typer.Typer(help=HELP, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key, e.g. settings.step=0.25. Repeatable.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one machine-readable object on stdout.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace the results of another fit in the folder.")]
 Shape = Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Voxels of a headerless file.")]
 Dtype = Annotated[str | None, typer.Option(help="NumPy type of a headerless file, such as uint8 or >i2.")]
 Spacing = Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Millimetres between voxels, in place of the file's.")]
@@ -31,7 +43,25 @@ ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="A configurat
 
 
 def _examples(*lines: str) -> str:
-    return "\n\n".join(["[bold]Examples[/bold]", *lines])
+    # The mark keeps the lines as they are.
+    return "\n".join(["\b", "Examples:", *(f"  {line}" for line in lines)])
+
+
+def _version(wanted: bool | None) -> None:
+    if wanted:
+        from jvr import __version__
+
+        typer.echo(f"jvr {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def every_command(
+    version: Annotated[
+        bool | None, typer.Option("--version", help="Say which jvr this is.", callback=_version, is_eager=True)
+    ] = None,
+) -> None:
+    """What comes before a command."""
 
 
 @app.command(epilog=_examples("jvr render configs/demo.toml -o demo.png", "jvr render head.nii.gz --preset ct_bone --size 800"))
@@ -56,8 +86,8 @@ def render(
     """Render a picture of a configuration's scene, or of a volume file directly."""
     from jvr.cli.render import render_pictures
 
-    output = Path(f"{given.name.split('.')[0]}.png") if output is None else output
     with reading():
+        output = Path(f"{name_of(given)}.png") if output is None else output
         check_image_output(output)
         transfer = None if preset is None else {"kind": "preset", "preset": preset}
         volume = _given(shape, spacing, origin, dtype=dtype, axes=axes, channel=channel, time=time, nan_value=nan_value)
@@ -76,6 +106,7 @@ def fit(
     given: ConfigFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results; created where it does not exist.")],
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the folder's checkpoint.npz.")] = False,
+    force: Force = False,
     sets: Set = None,
     as_json: Json = False,
 ) -> None:
@@ -89,7 +120,7 @@ def fit(
     with reading():
         config = load(given, sets or [])
         check_folder_output(output)
-    report = fit_scene(config, output, resume=resume)
+    report = fit_scene(config, output, resume=resume, force=force)
     _print(report, as_json, _summary(report, output))
 
 
@@ -120,6 +151,7 @@ def tune(
                 raise BadInput(f"{flag} must be a positive number, not {value:g}")
         config = load(given, sets or [])
         check_file_output(output, "tuned.toml")
+        check_inputs_stay(output, inputs_of(config))
     report = tune_settings(config, output, error, seconds)
     settings, lines = report["settings"], lines_of(report["precomputed"])
     for name in ("predicted", "measured"):
@@ -194,6 +226,7 @@ def info(
 @app.command(epilog=_examples("jvr demo", "jvr demo -o out"))
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("jvr-demo"),
+    force: Force = False,
     sets: Set = None,
     as_json: Json = False,
 ) -> None:
@@ -203,7 +236,7 @@ def demo(
     with reading():
         config = load(demo_config(), sets or [])
         check_folder_output(output)
-    report = fit_scene(config, output, resume=False)
+    report = fit_scene(config, output, force=force)
     _print(report, as_json, _summary(report, output))
 
 

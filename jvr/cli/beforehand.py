@@ -1,9 +1,11 @@
 """What a command computes before its pictures: projected materials and radiance transfer, kept in the user's cache."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jvr.cli.runtime import bar, cache_folder
-from jvr.model.scene import Scene
+
+if TYPE_CHECKING:
+    from jvr.model.scene import Scene
 
 
 class Beforehand:
@@ -12,7 +14,7 @@ class Beforehand:
     def __init__(self) -> None:
         self.report: list[dict[str, Any]] = []
 
-    def __call__(self, scene: Scene, **keywords: Any) -> Scene:
+    def __call__(self, scene: "Scene", **keywords: Any) -> "Scene":
         if scene.environment is None:
             return scene
         from jvr.io.precompute import precompute

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from jvr.cli.beforehand import Beforehand
-from jvr.cli.inputs import BadInput, Interrupted, reading, refused_by_jvr
+from jvr.cli.folder import CHECKPOINT, PAGE, RESULT, TRANSFER, alone_in, check_results, results_in
+from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by_jvr
 from jvr.cli.runtime import nested, plain, progress, provenance, use_compilation_cache
+from jvr.cli.signals import INTERRUPTED, Terminated, said
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
-
-CHECKPOINT = "checkpoint.npz"
-PAGE = "report.html"
 
 
 def demo_config() -> Path:
@@ -27,18 +26,28 @@ def demo_config() -> Path:
     return installed if installed.exists() else package.parent / "configs" / "demo.toml"
 
 
-def fit_scene(config: Config, folder: Path, *, resume: bool) -> dict[str, Any]:
-    """Runs the fit of a configuration and writes pictures, transfer function, numbers and page into `folder`."""
+def fit_scene(config: Config, folder: Path, *, resume: bool = False, force: bool = False) -> dict[str, Any]:
+    """Runs the fit of a configuration and writes pictures, transfer function, numbers and page into `folder`.
+
+    **Raises** `BadInput` where the folder holds what would be written over, and another fit writes there: `resume` goes on from its
+    checkpoint, `force` replaces results of another run.
+    """
     use_compilation_cache()
     began = time.perf_counter()
     beforehand = Beforehand()
     checkpoint = folder / CHECKPOINT
-    with reading(), progress("reading the volume and the target images"):
-        if resume and not checkpoint.exists():
-            raise BadInput(f"--resume: {checkpoint} does not exist; leave --resume out to start anew")
-        job = build_fit(config, prepare=beforehand)
-    folder.mkdir(parents=True, exist_ok=True)
-    with _about_the_kept_transfer(job):
+    with contextlib.ExitStack() as whole:
+        # A folder that is not there yet is made once the input is known to be good.
+        is_there = folder.exists()
+        if is_there:
+            whole.enter_context(alone_in(folder))
+        with reading(), progress("reading the volume and the target images"):
+            check_results(folder, inputs_of(config), resume=resume, force=force)
+            job = build_fit(config, prepare=beforehand)
+        if not is_there:
+            folder.mkdir(parents=True, exist_ok=True)
+            whole.enter_context(alone_in(folder))
+        whole.enter_context(_about_the_kept_transfer(job))
         result = _fit(job, checkpoint, resume)
         with progress("writing the results"):
             return _write(config, job, result, folder, began, beforehand)
@@ -61,9 +70,10 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
         checkpoint.unlink(missing_ok=True)
     try:
         return fit(job.scene, job.cameras, job.targets, **keywords)
-    except KeyboardInterrupt as error:
+    except (KeyboardInterrupt, Terminated) as error:
         kept = f"{checkpoint} is kept, --resume goes on from it" if checkpoint.exists() else "no step was finished"
-        raise Interrupted(f"interrupted: {kept}") from error
+        status = error.status if isinstance(error, Terminated) else INTERRUPTED
+        raise Interrupted(f"{said(status)}: {kept}", status) from error
     except ValueError as error:
         if not refused_by_jvr(error):
             raise
@@ -71,20 +81,24 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
 
 
 def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float, beforehand: Beforehand) -> dict[str, Any]:
-    from jvr.io.images import replacing
+    from jvr.atomic import replacing
 
     fitted = _pictures(result.scene, result.exposure, job.cameras, job)
+    # Of another run: it may have had more views.
+    for path in results_in(folder):
+        if path.name != CHECKPOINT:
+            path.unlink()
     for i, (target, found) in enumerate(zip(job.targets, fitted, strict=True)):
         _write_views(folder, f"{i:02d}", target, found)
     held_cameras, held_targets = job.held_out or ((), ())
     held_fitted = _pictures(result.scene, result.exposure, held_cameras, job)
     for i, (target, found) in enumerate(zip(held_targets, held_fitted, strict=True)):
         _write_views(folder, f"held_out_{i:02d}", target, found)
-    write_transfer(folder / "transfer.toml", result.scene.transfer)
+    write_transfer(folder / TRANSFER, result.scene.transfer)
     report = _report(config, job, result, (fitted, held_fitted))
     report["transfer_kept"] = _with_transfer_of_its_own(job, result, beforehand) if job.keeps_transfer else None
     report |= {"precomputed": beforehand.report, "seconds": time.perf_counter() - began}
-    with replacing(folder / "result.json") as temporary:
+    with replacing(folder / RESULT) as temporary:
         temporary.write_text(json.dumps(report, allow_nan=False, indent=1), encoding="utf-8")
     _write_page(folder, config, job, result, fitted)
     return report
@@ -106,7 +120,7 @@ def _pictures(scene: Any, exposure: float, cameras: Any, job: FitJob) -> list[np
 
 
 def _write_views(folder: Path, name: str, target: np.ndarray, fitted: np.ndarray) -> None:
-    from jvr.io.images import write_image
+    from jvr.pictures import write_image
 
     for kind, image in (("target", target), ("fitted", fitted), ("difference", fitted - target)):
         write_image(folder / f"{kind}_{name}.exr", image)
@@ -162,16 +176,11 @@ def _report(config: Config, job: FitJob, result: Any, pictures: Any) -> dict[str
 
 def _scores(targets: Any, fitted: Any) -> dict[str, Any]:
     """PSNR (of radiance 1) of each view and of all pixels together, and SSIM of each view; `null` for equal images."""
-    from skimage.metrics import structural_similarity
+    from jvr.rendering.measure import similarity
 
     decibels = lambda error: plain(-10 * np.log10(error)) if error > 0 else None
     squares = [float(np.mean(np.square(f.astype(np.float64) - t))) for t, f in zip(targets, fitted, strict=True)]
-    ssim = []
-    for target, found in zip(targets, fitted, strict=True):
-        window = min(7, (min(target.shape[:2]) + 1) // 2 * 2 - 1)
-        similar = window >= 3
-        score = structural_similarity(target, found, data_range=1.0, channel_axis=-1, win_size=window) if similar else np.nan
-        ssim.append(plain(score))
+    ssim = [similarity(target, found) for target, found in zip(targets, fitted, strict=True)]
     pixels = [target.size for target in targets]
     mean = decibels(float(np.average(squares, weights=pixels))) if squares else None
     return {"psnr": [decibels(s) for s in squares], "mean_psnr": mean, "ssim": ssim}

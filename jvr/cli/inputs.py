@@ -2,15 +2,17 @@
 
 import contextlib
 import os
+import re
 import sys
 import tempfile
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from jvr.io.config import Config, config_from, read_config
+if TYPE_CHECKING:
+    from jvr.io.config import Config
 
 IMAGES = (".exr", ".png")
 
@@ -20,7 +22,11 @@ class BadInput(Exception):
 
 
 class Interrupted(Exception):
-    """Ctrl-C; the message says what was kept."""
+    """Ctrl-C or SIGTERM; the message says what was kept."""
+
+    def __init__(self, message: str, status: int):
+        super().__init__(message)
+        self.status = status
 
 
 @contextlib.contextmanager
@@ -31,7 +37,7 @@ def reading() -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            raise BadInput(_system_problem(error)) from error
+            raise BadInput(system_problem(error)) from error
         except (ValueError, TypeError) as error:
             raise BadInput(str(error)) from error
 
@@ -58,8 +64,10 @@ def usage_problem(error: Any) -> str:
 
 def load(
     given: Path, sets: Sequence[str], volume: dict[str, Any] | None = None, transfer: dict[str, Any] | None = None
-) -> Config:
+) -> "Config":
     """The configuration of a TOML file, or one made up for a volume file that is named directly."""
+    from jvr.io.config import config_from, read_config
+
     if given.suffix.lower() == ".toml":
         if refused := [f"--{key.replace('_', '-')}" for key in (volume or {})] + (["--preset"] if transfer else []):
             raise BadInput(f"{refused[0]} is for a volume file; for a configuration use --set")
@@ -69,6 +77,51 @@ def load(
     data = {"volume": {"path": str(given.absolute()), **(volume or {})}, "transfer": transfer or {"kind": "window"}}
     data["background"] = [0.0, 0.0, 0.0]
     return config_from(data, str(given), given.parent, sets)
+
+
+def name_of(given: Path) -> str:
+    """A volume's or configuration's name without its ending; dots of its own stay: `scan.v2.nii.gz` is `scan.v2`."""
+    from jvr.io.volumes import READERS
+
+    name = given.resolve().name or "volume"
+    if given.is_dir() and not name.lower().endswith(".zarr"):
+        return name
+    endings = [ending for ending in (*READERS, ".toml") if name.lower().endswith(ending)]
+    return name[: -len(max(endings, key=len))] or name if endings else name
+
+
+def inputs_of(config: "Config") -> list[Path]:
+    """The files and folders that a configuration reads, itself among them, as far as they exist."""
+    named: list[tuple[str, str]] = []
+
+    def walk(value: Any, key: str) -> None:
+        if isinstance(value, dict):
+            for name, part in value.items():
+                walk(part, f"{key}.{name}".lstrip("."))
+        elif isinstance(value, list):
+            for i, part in enumerate(value):
+                walk(part, f"{key}.{i}")
+        elif isinstance(value, str) and re.search(r"(^|\.)path$|^fit\.images\.", key):
+            named.append((value, key))
+
+    walk(config.data, "")
+    found = [Path(config.name)] if Path(config.name).exists() else []
+    for path, key in named:
+        with contextlib.suppress(ValueError):
+            found.append(config.find(path, key))
+    return found
+
+
+def check_inputs_stay(output: Path, inputs: Sequence[Path]) -> None:
+    """Refuses an output that would take the place of an input, or join the files of a folder that is read."""
+    for path in inputs:
+        if path.is_dir():
+            siblings = output.parent.exists() and path.samefile(output.parent)
+            taken = siblings and any(p.suffix.lower() == output.suffix.lower() for p in path.iterdir())
+        else:
+            taken = output.exists() and path.samefile(output)
+        if taken:
+            raise BadInput(f"-o {output}: would change {path}, which is read; choose another name or folder")
 
 
 def check_image_output(path: Path) -> None:
@@ -105,6 +158,8 @@ def _try_to_write(folder: Path, flag: str) -> None:
         raise BadInput(f"{flag}: cannot write to {folder}: {error.strerror}; choose another folder") from error
 
 
-def _system_problem(error: OSError) -> str:
+def system_problem(error: OSError) -> str:
     """Jvr's own messages name the file already; the system's have it in an attribute."""
-    return f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
+    if error.strerror is None:
+        return str(error)
+    return f"{error.filename}: {error.strerror}" if error.filename else f"{error.strerror}: output is cut short"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jvr.cli.beforehand import Beforehand
-from jvr.cli.inputs import BadInput, reading, refused_by_jvr
+from jvr.cli.inputs import BadInput, check_inputs_stay, inputs_of, reading, refused_by_jvr
 from jvr.cli.runtime import plain, progress, provenance, use_compilation_cache
 from jvr.io.config import Config, build_cameras, build_scene, build_settings
 
@@ -20,15 +20,18 @@ def render_pictures(config: Config, output: Path) -> dict[str, Any]:
     with reading():
         scene, settings = build_scene(config), build_settings(config)
         cameras = build_cameras(config, scene.volume)
+        outputs, inputs = _names(output, len(cameras)), inputs_of(config)
+        for path in outputs:
+            check_inputs_stay(path, inputs)
         scene = beforehand(scene)
     import equinox as eqx
     import jax
 
     from jvr.cli.runtime import compiling
-    from jvr.io.images import write_image
+    from jvr.pictures import write_image
     from jvr.rendering.image import render
 
-    pictures, outputs, compile_seconds = [], _names(output, len(cameras)), 0.0
+    pictures, compile_seconds = [], 0.0
     if settings.skipping:
         scene = eqx.tree_at(lambda s: s.volume, scene, scene.volume.bricked())
     with progress("rendering"):

@@ -1,12 +1,12 @@
 """`jvr tune`."""
 
-import os
 import re
 import time
 import tomllib
 from pathlib import Path
 from typing import Any
 
+from jvr.atomic import replacing
 from jvr.cli.beforehand import Beforehand
 from jvr.cli.inputs import BadInput, reading
 from jvr.cli.runtime import progress, provenance, use_compilation_cache
@@ -42,9 +42,8 @@ def tune_settings(config: Config, output: Path, error: float | None, seconds: fl
         raise BadInput(
             f"--time {seconds:g} is out of reach on this scene: the least that was reached is {found.measured.seconds:.2g} s"
         )
-    temporary = output.with_name(f".{output.name}.partial")
-    temporary.write_text(with_settings(config.text, found.settings), encoding="utf-8")
-    os.replace(temporary, output)
+    with replacing(output) as temporary:
+        temporary.write_text(with_settings(config.text, found.settings), encoding="utf-8")
     return {
         "command": "tune",
         "config": config.name,

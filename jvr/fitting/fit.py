@@ -22,10 +22,11 @@ from jvr.fitting.objective import Problem, march_unknowns
 from jvr.fitting.observations import Observations, check_images, is_mostly_empty, keep_samples, observe
 from jvr.fitting.solvers import AbstractSolver
 from jvr.fitting.unknowns import Exposed, Unknowns, choose_unknowns
-from jvr.fitting.work import Work, fingerprint
+from jvr.fitting.work import Work
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import render
+from jvr.rendering.measure import similarity
 from jvr.rendering.medium import needs_gradient
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
@@ -163,7 +164,7 @@ def fit(
     observations = observe(scene, cameras, targets, weights, settings, chunk)
     problem, observations = _keep(problem, observations, chunk, keep_samples)
     work = Work(problem, observations, chunk, cameras, targets)
-    mark = fingerprint(problem, observations, solver) if checkpoint else ""
+    mark = checkpoints.fingerprint(problem, observations, solver) if checkpoint else {}
     state, history = solver.init(work.functions, chosen.real_from_model(model)), []
     if checkpoint and resume and Path(checkpoint).exists():
         state, rows = checkpoints.load(Path(checkpoint), state, mark)
@@ -280,17 +281,14 @@ def _compare(
     found: Exposed, settings: Settings, cameras: Sequence[AbstractCamera], images: Any
 ) -> tuple[tuple[float, float], ...]:
     """PSNR and SSIM of views that took no part in the fit."""
-    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+    from skimage.metrics import peak_signal_noise_ratio
 
     exposure = 1.0 if found.exposure is None else float(found.exposure)
     scores = []
     for camera, target in zip(cameras, check_images(cameras, images, "held-out image"), strict=True):
         rendered = exposure * np.asarray(render(found.scene, camera, settings).rgb)
         psnr = peak_signal_noise_ratio(target, rendered, data_range=1.0)
-        # An odd window that fits into the smallest picture.
-        window = min(7, (min(target.shape[:2]) - 1) // 2 * 2 + 1)
-        ssim: Any = structural_similarity(target, rendered, data_range=1.0, channel_axis=-1, win_size=window)
-        scores.append((float(psnr), float(ssim)))
+        scores.append((float(psnr), similarity(target, rendered)))
     return tuple(scores)
 
 

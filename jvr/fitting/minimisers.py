@@ -34,6 +34,11 @@ def _factor(function: Any, real: Array) -> Array:
     return jnp.where(loss > 0, real.size / jnp.where(loss > 0, loss, 1.0), 1.0)
 
 
+@eqx.filter_jit
+def _value(function: Any, real: Array) -> Array:
+    return function(real, None)[0]
+
+
 class GradientState(NamedTuple):
     """`inner` is the other library's state; `best` and `best_loss` the best point it has accepted; `factor` that of `Scaled`."""
 
@@ -63,6 +68,12 @@ def _moved(state: GradientState, real: Array, inner: Any, here: Array, loss: Arr
     return GradientState(real, inner, best, best_loss, state.factor, jnp.where(finite, finished.astype(int), 2))
 
 
+def _unless_exact(functions: Functions, state: GradientState) -> GradientState:
+    """Converged where the pictures differ by their rounding alone: libraries compare changes, and of rounding there is no end."""
+    exact = float(state.best_loss / state.factor) <= functions.rounding
+    return state._replace(done=jnp.asarray(1)) if exact else state
+
+
 def _begin(real: Array, inner: Any, factor: Array) -> GradientState:
     return GradientState(real, inner, real, jnp.asarray(jnp.inf, real.dtype), factor, jnp.asarray(0))
 
@@ -79,7 +90,7 @@ class OptimistixSolver(AbstractGradientSolver):
         return _begin(real, _init(self.solver, self._function(functions, factor), real), factor)
 
     def step(self, functions: Functions, state: GradientState) -> GradientState:
-        return _step(self.solver, self._function(functions, state.factor), state)
+        return _unless_exact(functions, _step(self.solver, self._function(functions, state.factor), state))
 
     @property
     def bounds(self) -> None:
@@ -125,10 +136,14 @@ class LBFGSB(AbstractGradientSolver):
         bounds = _bounds(functions, real)
         real = jnp.clip(real, *bounds)
         factor = _factor(functions.value, real)
-        return _begin(real, _bounded_init(self.tol, self.history, Scaled(functions.value, factor), real, bounds), factor)
+        scaled = Scaled(functions.value, factor)
+        state = _begin(real, _bounded_init(self.tol, self.history, scaled, real, bounds), factor)
+        # Its first step may end at a worse point: the start counts as one that it has accepted.
+        return state._replace(best_loss=_value(scaled, real))
 
     def step(self, functions: Functions, state: GradientState) -> GradientState:
-        return _bounded_step(self.tol, self.history, Scaled(functions.value, state.factor), state, _bounds(functions, state.real))
+        scaled = Scaled(functions.value, state.factor)
+        return _unless_exact(functions, _bounded_step(self.tol, self.history, scaled, state, _bounds(functions, state.real)))
 
     @property
     def bounds(self) -> Interval:

@@ -17,6 +17,7 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.exact import Exact
 from jvr.model.scene import Scene
 from jvr.numerics import two_sum
+from jvr.pictures import as_radiance
 from jvr.rendering.medium import medium, natural, occupancy, visibility
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
@@ -69,9 +70,9 @@ class Samples(eqx.Module):
 def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "target image") -> list[np.ndarray]:
     """The images as float arrays, one for each camera and of its size.
 
-    **Raises** `ValueError` where their number or a size differs, or a pixel is not finite.
+    **Raises** `ValueError` where their number or a size differs, a pixel is not finite, or they hold codes in place of radiance.
     """
-    images = [np.asarray(image, dtype=jnp.result_type(float)) for image in images]
+    images = [as_radiance(image, f"{name} {i}").astype(jnp.result_type(float)) for i, image in enumerate(images)]
     if len(images) != len(cameras) or not images:
         raise ValueError(
             f"there are {len(images)} images for {len(cameras)} cameras: give one image for each camera, and at least one"
@@ -84,6 +85,12 @@ def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "ta
         if not np.all(np.isfinite(image)):
             raise ValueError(
                 f"{name} {i} has {np.sum(~np.isfinite(image))} values that are not finite: give them weight 0 and replace them"
+            )
+        # A photograph that was only converted to floating point.
+        if image.max() >= 16 and np.array_equal(image, np.rint(image)):
+            raise ValueError(
+                f"{name} {i} holds whole numbers up to {image.max():g}, radiance has white at 1: "
+                "convert codes by jvr.linear_from_srgb(codes / 255)"
             )
     return images
 

@@ -1,7 +1,6 @@
 """The functions that solvers call, over the rays of one fit."""
 
 import functools
-import hashlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -169,14 +168,6 @@ class Work:
         residuals = ResidualFunction(self.problem, self.pieces, jnp.asarray(self.total))
         levels = tuple(functools.partial(self.expand, i) for i in range(len(self.levels)))
         return Functions(function, residuals, levels, self.limits, self.quadratic, self._rounding())
-
-
-def fingerprint(problem: Problem, observations: Observations, solver: Any) -> str:
-    """A digest of everything that a fit depends on, so that a checkpoint is not taken up by another one."""
-    digest = hashlib.sha256(repr((jax.tree.structure(problem), solver)).encode())
-    for leaf in jax.tree.leaves((problem.model, observations)):
-        digest.update(np.asarray(leaf).tobytes())
-    return digest.hexdigest()
 
 
 def _total(observations: Observations) -> float:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from jvr.io.images import ImageError, read_image
+from jvr.io.images import read_image
+from jvr.pictures import ImageError
 
 
 def read_environment(path: str | os.PathLike) -> Float32[np.ndarray, "height width 3"]:

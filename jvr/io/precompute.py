@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import os
 import time
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jvr.atomic import replacing
 from jvr.effects.radiance_transfer import MaterialBleeding, ProjectedTransfer
 from jvr.effects.transfer_grid import TransferProjection, finished, project_all, transfer_of
-from jvr.io.images import replacing
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
 from jvr.parallel import in_threads, workers
@@ -63,7 +64,7 @@ def precompute(
     **Arguments:** `cache`: a folder to keep results in, named by the content of what they were computed from; `progress`: called with the
     share that is done, 0 ... 1; `report`: called with each part once it is there; `keep_material`: leave the material as it is, and
     `keep_unscattered`: leave the scattering pass to each picture, so that material and dipole can be fitted.
-    Not traceable. **Raises** `OSError` where the folder cannot be written.
+    Not traceable. Warns where a result cannot be written. **Raises** `OSError` where the folder cannot be made.
     """
     environment = scene.environment
     if environment is None:
@@ -185,8 +186,12 @@ def _kept(
     found = None if path is None else _found(path, function, inputs)
     result = jax.block_until_ready(compute()) if found is None else found
     if path is not None and found is None:
-        with replacing(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, *[np.asarray(x) for x in jax.tree.leaves(result)])
+        try:
+            with replacing(path) as temporary, temporary.open("wb") as file:
+                np.savez(file, *[np.asarray(x) for x in jax.tree.leaves(result)])
+        except OSError as error:
+            # Minutes of work are not lost for want of a place to keep them.
+            warnings.warn(f"{error}; the {part} is used and not kept", RuntimeWarning, stacklevel=2)
     nbytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(result))
     report(Precomputed(part, time.perf_counter() - began, found is not None, nbytes))
     return result

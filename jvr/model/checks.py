@@ -9,6 +9,11 @@ from jaxtyping import Array, Float
 
 from jvr.types import Affine, ArrayLike
 
+# Source colours and backgrounds above this are codes that were taken for radiance; lights have their own, far larger scale, up to
+# where squares of radiance overflow single precision.
+LARGEST_COLOUR = 100.0
+LARGEST_RADIANCE = 1e15
+
 
 def float_array(value: ArrayLike | Any, name: str, *shapes: tuple[int | None, ...]) -> Float[Array, "..."]:
     """`value` as a floating-point array whose shape is one of `shapes` (`None` stands for any length).
@@ -40,6 +45,37 @@ def require(value: Any, condition: Any, message: str) -> None:
     values = known(value)
     if values is not None and not np.all(condition(values)):
         raise ValueError(message)
+
+
+def colours(value: ArrayLike | Any, name: str, *shapes: tuple[int | None, ...]) -> Float[Array, "..."]:
+    """`float_array` of linear RGB of which 1 is white: finite, not negative, and not the codes of a file or a screen.
+
+    **Raises** `ValueError` for whole numbers above 1 and for anything above `LARGEST_COLOUR`, with the remedy.
+    """
+    array = float_array(value, name, *shapes)
+    require(
+        array, lambda c: np.isfinite(c) & (c >= 0), f"{name} must be finite and not negative: it is linear RGB, and 1 is white"
+    )
+    values, given = known(array), None if isinstance(value, Tracer) else np.asarray(value)
+    are_codes = given is not None and given.dtype.kind in "iu" and bool(np.any(given > 1))
+    if values is not None and (are_codes or np.any(values > LARGEST_COLOUR)):
+        raise ValueError(
+            f"{name} goes up to {values.max():g}, but 1 is white: convert codes by jvr.linear_from_srgb(codes / 255), "
+            f"and give brighter colours as floating-point numbers up to {LARGEST_COLOUR:g}"
+        )
+    return array
+
+
+def radiances(value: ArrayLike | Any, name: str) -> Float[Array, "..."]:
+    """`float_array` of the strength of a light, one number or `(3,)`: finite, not negative, at most `LARGEST_RADIANCE`, and not 8 or 16-bit
+    codes. **Raises** `ValueError` otherwise."""
+    array = float_array(value, name, (), (3,))
+    require(array, lambda c: np.isfinite(c) & (c >= 0), f"{name} must be finite and not negative")
+    require(array, lambda c: c <= LARGEST_RADIANCE, f"{name} must be at most {LARGEST_RADIANCE:g}: brighter pictures overflow")
+    if isinstance(value, np.ndarray) and value.dtype in (np.uint8, np.uint16):
+        white = 255 if value.dtype == np.uint8 else 65535
+        raise ValueError(f"{name} holds codes ({value.dtype}): convert them by jvr.linear_from_srgb(codes / {white})")
+    return array
 
 
 def affine(value: Any, name: str) -> Affine:

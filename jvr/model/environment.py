@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model import harmonics
-from jvr.model.checks import float_array, require
+from jvr.model.checks import float_array, known, radiances, require
 from jvr.model.harmonics.projection import cap
 from jvr.numerics import normalise
+from jvr.pictures import as_radiance
 from jvr.types import ArrayLike
 
 
@@ -48,6 +49,8 @@ class EnvironmentLight(eqx.Module):
             from jvr.io.environment import read_environment
 
             image = read_environment(image)
+        if known(image) is not None:
+            as_radiance(image, "an environment map")
         pixels = float_array(image, "an environment map", (None, None, 3))
         height, width, _ = pixels.shape
         if width != 2 * height:
@@ -67,7 +70,7 @@ class EnvironmentLight(eqx.Module):
     @classmethod
     def constant(cls, radiance: ArrayLike = 1.0, order: int = 0) -> "EnvironmentLight":
         """The same radiance, a number or `(3,)`, from everywhere."""
-        rgb = jnp.broadcast_to(float_array(radiance, "radiance", (), (3,)), (3,))
+        rgb = jnp.broadcast_to(radiances(radiance, "radiance"), (3,))
         coefficients = jnp.zeros(((order + 1) ** 2, 3), rgb.dtype)
         return cls(coefficients.at[0].set(math.sqrt(4 * math.pi) * rgb))
 
@@ -79,7 +82,7 @@ class EnvironmentLight(eqx.Module):
         require(angle, lambda a: (a > 0) & (a <= 180), "half_angle must be above 0 and at most 180 degrees")
         axis = float_array(towards, "towards", (3,))
         require(jnp.linalg.norm(axis), lambda n: np.isfinite(n) & (n > 0), "towards must be a direction, not zero")
-        rgb = jnp.broadcast_to(float_array(radiance, "radiance", (), (3,)), (3,))
+        rgb = jnp.broadcast_to(radiances(radiance, "radiance"), (3,))
         kernel = jnp.stack(cap(2 * jnp.square(jnp.sin(jnp.deg2rad(angle) / 2)), order))
         about = harmonics.evaluate(order, normalise(axis)[None])[0]
         return cls(harmonics.convolve(about, kernel)[:, None] * rgb)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jvr.model.checks import float_array, require
+from jvr.model.checks import colours, float_array, require
 from jvr.model.ranges import EXTINCTION, NOT_NEGATIVE, SHARE, Increasing, within
 from jvr.model.transfer import AbstractTransfer, Classified, any_between
 from jvr.types import ArrayLike, Channels, Scalar
@@ -30,11 +30,10 @@ class GradientTransfer(AbstractTransfer):
     magnitudes: Float[Array, "2"] = eqx.field(metadata=within(Increasing()))
 
     def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike, magnitudes: ArrayLike):
-        self.rgb = float_array(rgb, "rgb", (None, None, 3))
+        self.rgb = colours(rgb, "rgb", (None, None, 3))
         n, m, _ = self.rgb.shape
         if n < 2 or m < 2:
             raise ValueError(f"a GradientTransfer needs at least 2 x 2 entries, not {n} x {m}")
-        require(self.rgb, np.isfinite, "rgb must be finite")
         self.sigma_t = float_array(sigma_t, "sigma_t", (n, m), (n, m, 3))
         require(self.sigma_t, EXTINCTION.holds, "sigma_t must be finite and not negative")
         increasing = lambda d: np.isfinite(d) & (d[0] < d[1])

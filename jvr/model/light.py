@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.model.checks import float_array, require
+from jvr.model.checks import float_array, radiances, require
 from jvr.model.exact import Exact, Remainder, in_double
 from jvr.model.ranges import DEGREES, NOT_NEGATIVE, POSITIVE, UnitVector, within
 from jvr.numerics import direction_and_length, divide_or_zero
@@ -259,9 +259,7 @@ def _direction(value: ArrayLike, name: str) -> Vector:
 
 
 def _colour(value: ArrayLike, name: str) -> Float[Array, "..."]:
-    colour = float_array(value, name, (), (3,))
-    require(colour, NOT_NEGATIVE.holds, f"a light's {name} must be finite and not negative")
-    return colour
+    return radiances(value, f"a light's {name}")
 
 
 def _rgb(colour: Float[Array, "..."]) -> Triple:

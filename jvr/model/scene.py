@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 
-from jvr.model.checks import float_array
+from jvr.model.checks import colours
 from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer, AbstractScattering, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
 from jvr.model.light import AbstractLight, AmbientLight
@@ -75,7 +75,7 @@ class Scene(eqx.Module):
     ):
         self.volume = volume
         self.transfer = transfer
-        self.background = None if background is None else float_array(background, "background", (3,))
+        self.background = None if background is None else colours(background, "background", (3,))
         self.optical = optical
         self.clipping = clipping
         self.lights = tuple(lights)

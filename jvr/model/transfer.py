@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jvr.model.checks import float_array, require
+from jvr.model.checks import colours, float_array, require
 from jvr.model.ranges import EXTINCTION, POSITIVE, SHARE, Increasing, within
 from jvr.numerics import divide_or_zero, read_run
 from jvr.types import ArrayLike, Channels, Scalar, Triple
@@ -115,10 +115,11 @@ class LutTransfer(AbstractTable):
     domain: Float[Array, "2"] = eqx.field(metadata=within(Increasing()))
 
     def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike):
-        rgb = float_array(rgb, "rgb", (None, 3))
-        if rgb.shape[0] < 2:
-            raise ValueError(f"a transfer function needs at least 2 entries, not {rgb.shape[0]}")
-        self.rgb, self.sigma_t = _colour(rgb, rgb.shape[0]), _extinction(sigma_t, rgb.shape[0])
+        self.rgb = colours(rgb, "rgb", (None, 3))
+        n = self.rgb.shape[0]
+        if n < 2:
+            raise ValueError(f"a transfer function needs at least 2 entries, not {n}")
+        self.sigma_t = _extinction(sigma_t, n)
         self.domain = float_array(domain, "domain", (2,))
         require(self.domain, lambda d: np.isfinite(d) & (d[0] < d[1]), "domain must be (low, high) with low < high")
 
@@ -207,9 +208,7 @@ def any_between(
 
 
 def _colour(rgb: ArrayLike, n: int) -> Float[Array, "n 3"]:
-    rgb = float_array(rgb, "rgb", (n, 3))
-    require(rgb, np.isfinite, "rgb must be finite")
-    return rgb
+    return colours(rgb, "rgb", (n, 3))
 
 
 def _extinction(sigma_t: ArrayLike, n: int, name: str = "sigma_t") -> Float[Array, "..."]:

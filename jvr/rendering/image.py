@@ -2,6 +2,7 @@
 
 import functools
 import math
+import os
 from typing import Any
 
 import equinox as eqx
@@ -49,6 +50,23 @@ class Rendering(eqx.Module):
     alpha: Float[Array, "height width"]
     depth: Float[Array, "height width"]
     stats: RenderStats
+
+    def save(self, path: str | os.PathLike, *, transparent: bool = False) -> None:
+        """Writes the picture: `.png` as sRGB, or `.exr` as linear radiance with the depth as channel Z.
+
+        `transparent`: with alpha, for pictures of a scene without a background, whose `rgb` is light over black.
+        **Raises** what `jvr.write_image` raises.
+        """
+        from jvr.pictures import write_image
+
+        is_exr = str(path).lower().endswith(".exr")
+        write_image(path, self.rgb, self.alpha if transparent else None, depth=self.depth if is_exr else None)
+
+    def _repr_png_(self) -> bytes:
+        """What notebooks show; pixels that are not finite in magenta."""
+        from jvr.pictures import shown
+
+        return shown(self.rgb)
 
 
 def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()) -> Rendering:

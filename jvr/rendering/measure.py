@@ -110,19 +110,32 @@ def _reference(scene: Scene, camera: AbstractCamera, settings: Settings, unknown
         return np.asarray(rgb), jax.tree.map(np.asarray, gradient)
 
 
-def _compare(truth: Any, settings: Settings, seconds: float, compile_seconds: float, found: Any) -> Measurement:
+def similarity(true: np.ndarray, found: np.ndarray, bright: float = 1.0) -> float:
+    """Structural similarity (Wang et al. 2004) of two pictures `(height, width, 3)` with radiance 0 ... `bright`; 1 where they are equal.
+
+    Windows are 7 pixels wide, or the most that fit; pictures of less than 3 pixels are continued by their edge.
+    """
     from skimage.metrics import structural_similarity
 
+    if np.array_equal(true, found):
+        return 1.0
+    missing = [(0, max(3 - n, 0)) for n in true.shape[:2]]
+    true, found = (np.pad(image, [*missing, (0, 0)], mode="edge") for image in (true, found))
+    window = min(7, (min(true.shape[:2]) - 1) // 2 * 2 + 1)
+    ssim: Any = structural_similarity(true, found, data_range=bright, channel_axis=-1, win_size=window)
+    return float(ssim)
+
+
+def _compare(truth: Any, settings: Settings, seconds: float, compile_seconds: float, found: Any) -> Measurement:
     (true_rgb, true_gradient), (rgb, samples, gradient) = truth, found
     rgb = np.asarray(rgb, np.float64)
     difference = rgb - true_rgb
     bright = max(float(true_rgb.max() - true_rgb.min()), np.finfo(float).tiny)
-    # An odd window that fits into the smallest picture; pictures of less than 3 pixels have no structure.
-    window = min(7, (min(rgb.shape[:2]) - 1) // 2 * 2 + 1)
-    ssim: Any = structural_similarity(true_rgb, rgb, data_range=bright, channel_axis=-1, win_size=window) if window > 2 else 1.0
     error = None
     if gradient is not None:
         flat = lambda tree: np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in jax.tree.leaves(tree)])
         error = float(np.linalg.norm(flat(gradient) - flat(true_gradient)) / np.linalg.norm(flat(true_gradient)))
     rmse, largest = float(np.sqrt(np.mean(difference**2))), float(np.abs(difference).max())
-    return Measurement(settings, seconds, max(compile_seconds, 0.0), int(samples), rmse, largest, float(ssim), error)
+    return Measurement(
+        settings, seconds, max(compile_seconds, 0.0), int(samples), rmse, largest, similarity(true_rgb, rgb, bright), error
+    )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from jvr.atomic import replacing
 from jvr.io.config.errors import ConfigError, blame, first_complaint
 from jvr.io.config.schema.transfer import (
     AnyTransfer,
@@ -23,7 +24,6 @@ from jvr.io.config.schema.transfer import (
     TransferTable,
     WindowTable,
 )
-from jvr.io.images import replacing
 from jvr.model import presets
 from jvr.model.gradient_transfer import GradientOpacity, GradientTransfer
 from jvr.model.transfer import AbstractTransfer, GaussianTransfer, LinearTransfer, LutTransfer

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jvr.io.images import replacing
+from jvr.atomic import replacing
 from jvr.model.transfer import AbstractTransfer
 from jvr.report.errors import field_errors
 from jvr.report.page.summary import determination, summary, verdict

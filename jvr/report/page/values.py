@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jvr.io.images import srgb_from_linear
 from jvr.model.transfer import AbstractTransfer, GaussianTransfer
+from jvr.pictures import srgb_from_linear
 from jvr.report.page.words import COLOURS, TITLES, entries_in_words, with_error
 
 # Longer tables are folded away until a reader opens them.

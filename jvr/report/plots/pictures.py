@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jvr.io.images import srgb_from_linear
+from jvr.pictures import srgb_from_linear
 from jvr.report.plots.look import INK, SOFT, WIDTH
 
 if TYPE_CHECKING:

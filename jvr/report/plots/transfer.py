@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jvr.io.images import srgb_from_linear
 from jvr.model.transfer import AbstractTable, AbstractTransfer, GaussianTransfer
+from jvr.pictures import srgb_from_linear
 from jvr.report.errors import field_errors
 from jvr.report.plots.look import BLUE, GREEN, HATCH, INK, ORANGE, PALE, SOFT, WIDTH, style
 

@@ -2,15 +2,25 @@
 
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from jvr.io.config.checks import increasing, number, numbers, numbers_or_triples, problem, whole
-from jvr.io.config.errors import did_you_mean
+from jvr.io.config.errors import did_you_mean, shown
+
+
+def _no_codes(value: Any) -> Any:
+    if isinstance(value, list) and any(isinstance(v, int) and v > 1 for v in value):
+        raise problem(
+            f"{shown(value)} look like codes 0 ... 255, colours are linear and 1 is white: write ((code / 255 + 0.055) / 1.055)^2.4, "
+            "or brighter ones with a decimal point"
+        )
+    return value
+
 
 Scalar = Annotated[float, number("in the data's own units")]
 Length = Annotated[float, number("mm", 0.0, inner=True)]
 Position = Annotated[list[float], numbers(3, "x, y, z in mm")]
-Colour = Annotated[list[float], numbers(3, "red, green, blue, linear")]
+Colour = Annotated[list[float], numbers(3, "red, green, blue, linear", 0.0), BeforeValidator(_no_codes)]
 Positions = Annotated[list[float], numbers(None, "in the data's own units"), AfterValidator(increasing)]
 Range = Annotated[list[float], numbers(2, "low, high in the data's own units"), AfterValidator(increasing)]
 Extinctions = Annotated[list[Any], numbers_or_triples("extinction per mm", 0.0)]
