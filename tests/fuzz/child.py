@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from mutations import mutated
-from seeds import Seed, all_seeds
+from seeds import Seed, all_seeds, faulty
 
 # Seeds have 10 kB at most, a deflate stream of which announces 11 MB at most: four times that, and what a process does by itself.
 MOST_MEMORY, MOST_SECONDS = 64 << 20, 2.0
@@ -61,7 +61,7 @@ def main(number: int, count: int, jobs: list[tuple[str, int]]) -> None:
     warnings.simplefilter("ignore")
     folder = Path(tempfile.mkdtemp())
     try:
-        seeds = all_seeds(folder)
+        seeds = all_seeds(folder) | faulty()
         for name, first in jobs:
             seed, place = seeds[name], folder / "one"
             for k in range(first - 1, count):
@@ -71,7 +71,8 @@ def main(number: int, count: int, jobs: list[tuple[str, int]]) -> None:
                 for file, content in (seed.files if k < 0 else damaged(seed, name, number, k)).items():
                     (place / file).write_bytes(content)
                 if k < 0:
-                    seed.read(place / seed.main)
+                    if not name.startswith("faulty"):
+                        seed.read(place / seed.main)
                     with contextlib.suppress(ValueError):
                         resource.setrlimit(resource.RLIMIT_AS, (_address_space() + (2 << 30), resource.RLIM_INFINITY))
                     continue

@@ -4,7 +4,10 @@ import base64
 import bz2
 import dataclasses
 import gzip
+import os
+import signal
 import struct
+import time
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -59,8 +62,9 @@ NRRD = (
     'space units: "mm" "mm" "mm"\nspace origin: (1,2,3)\nkey:=value\n'
 )
 NRRD_LIST = (
-    'NRRD0004\ntype: uint8\ndimension: 4\nsizes: 2 7 5 3\nspacings: nan 1 1 2\nunits: "" "mm" "mm" "mm"\nkinds: vector domain domain domain\n'
-    "centers: cell cell node node\naxis mins: nan 1 2 3\nencoding: raw\nbyte skip: -1\ndata file: {file}\n"
+    'NRRD0004\ntype: uint8\ndimension: 4\nsizes: 2 7 5 3\nspacings: nan 1 1 2\nunits: "" "mm" "mm" "mm"\n'
+    "kinds: vector domain domain domain\ncenters: cell cell node node\n"
+    "axis mins: nan 1 2 3\nencoding: raw\nbyte skip: -1\ndata file: {file}\n"
 )
 
 
@@ -226,6 +230,26 @@ def tables(folder: Path) -> dict[str, Seed]:
     seeds["merl"] = _merl()
     seeds["checkpoint"] = _checkpoint(folder)
     return seeds
+
+
+# --- Readers that fail, for the tests of the fuzzer itself ------------------------------------------------------------
+
+
+def faulty() -> dict[str, Seed]:
+    held = []
+
+    def waits(path: Path) -> None:
+        end = time.process_time() + 2.2
+        while time.process_time() < end:
+            pass
+
+    readers = {
+        "faulty: signal": lambda path: os.kill(os.getpid(), signal.SIGSEGV),
+        "faulty: exception": lambda path: {}["key"],
+        "faulty: time": waits,
+        "faulty: memory": lambda path: held.append(np.ones(10**7)),
+    }
+    return {name: Seed({"a.txt": b"text\n"}, "a.txt", read, (VolumeError,)) for name, read in readers.items()}
 
 
 def all_seeds(folder: Path) -> dict[str, Seed]:
