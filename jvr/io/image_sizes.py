@@ -97,6 +97,10 @@ def _bytes_each(path: Path, channels: bytes) -> int:
         end = channels.find(b"\0", position)
         if end < 0 or end + 17 > len(channels):
             raise _damaged(path, "its list of channels is cut short")
+        try:
+            channels[position:end].decode()
+        except UnicodeDecodeError:
+            raise _damaged(path, "the name of a channel is no text") from None
         kind, *sampling = struct.unpack_from("<i4x2i", channels, end + 1)
         if kind not in (0, 1, 2) or min(sampling) < 1:
             raise _damaged(path, "a channel has an unknown type or sampling")

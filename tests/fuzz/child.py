@@ -64,7 +64,7 @@ def main(number: int, count: int, jobs: list[tuple[str, int]]) -> None:
         seeds = all_seeds(folder) | faulty()
         for name, first in jobs:
             seed, place = seeds[name], folder / "one"
-            for k in range(first - 1, count):
+            for k in range(first or -1, count):
                 shutil.rmtree(place, ignore_errors=True)
                 place.mkdir()
                 # Before the first of them the whole file, which must be read.

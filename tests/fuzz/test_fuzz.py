@@ -1,12 +1,12 @@
 """Two hundred damaged files of each format: none ends a process, takes long or much, or raises what is not documented."""
 
-import os
+import re
 
 import pytest
 from parent import findings
 from seeds import all_seeds
 
-COUNT = int(os.environ.get("JVR_FUZZ", "200"))
+COUNT = 200
 
 
 @pytest.fixture(scope="module")
@@ -26,4 +26,4 @@ def test_the_fuzzer_sees_signals_exceptions_time_and_memory():
     assert "ended the process with -11" in signal
     assert "KeyError" in exception
     assert "took 2." in time
-    assert "took 76 MiB" in memory
+    assert re.search(r"took \d\d MiB", memory)

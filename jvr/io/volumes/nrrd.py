@@ -241,6 +241,7 @@ def _on_axes(path: Path, fields: Fields, spatial: list[int], shape: tuple[int, .
     nodes = [centre.lower() == "node" for centre in centres]
     low = [_number(path, "axis mins", word) for word in of_space("axismins")]
     spacing, origin = np.ones(3), np.zeros(3)
+    units = [1.0] * len(spatial)
     if given.spacing is None:
         lengths = [_number(path, "spacings", word, positive=True) for word in of_space("spacings")]
         high = [_number(path, "axis maxs", word) for word in of_space("axismaxs")]
@@ -252,10 +253,11 @@ def _on_axes(path: Path, fields: Fields, spatial: list[int], shape: tuple[int, .
         if len(known) < len(lengths):
             payload.said(path, "the header states no voxel size: voxels are taken as 1 mm; else give spacing=")
         else:
-            spacing[: len(spatial)] = np.array(known) * _scales(path, "units", of_space("units"))
+            units = _scales(path, "units", of_space("units"))
+            spacing[: len(spatial)] = np.array(known) * units
     for i, start in enumerate(low):
         if given.origin is None and start is not None:
-            origin[i] = start + (0 if nodes[i] else spacing[i] / 2)
+            origin[i] = start * units[i] + (0 if nodes[i] else spacing[i] / 2)
     return affine_of(spacing, origin)
 
 

@@ -34,8 +34,9 @@ def read_slc(path: Path, given: Given) -> Stored:
         raise VolumeError(
             path, f"its slices are packed in a way with the number {words[10]}; only 0 (plain) and 1 (runs) are read"
         )
-    icon = grid_numbers(path, "the icon's size", words[11:13], positive=False)
-    stored = path.stat().st_size - header.end() - int(3 * icon[0] * icon[1])
+    if not all(re.fullmatch(r"\d{1,6}", word, re.ASCII) for word in words[11:13]):
+        raise VolumeError(path, f"the icon's size is {' x '.join(words[11:13])}; it must be whole numbers: the file is damaged")
+    stored = path.stat().st_size - header.end() - 3 * int(words[11]) * int(words[12])
     check_size(path, shape, 1, stored * (MOST_PACKED if words[10] == "1" else 1))
     if not 0 < stored <= path.stat().st_size:
         raise VolumeError(path, "its icon is larger than the file: it is cut short or damaged")
