@@ -50,7 +50,7 @@ def test_metaimages_lie_where_itk_puts_them(tmp_path, fields):
 def test_metaimages_in_text_lists_patterns_and_behind_headers(tmp_path):
     values = voxels(*SHAPE)
     text = " ".join(map(str, values.ravel(order="F"))).encode()
-    same_as_itk(meta(tmp_path / "a.mha", text, BinaryData=False))
+    np.testing.assert_array_equal(np.asarray(read_volume(meta(tmp_path / "a.mha", text, BinaryData=False)).values), values)
     for k in range(3):
         (tmp_path / f"{k}.raw").write_bytes(b"head" + values[:, :, k].tobytes(order="F"))
     names = "LIST\n" + "\n".join(f"{k}.raw" for k in range(3))
@@ -84,7 +84,8 @@ def test_what_metaimages_leave_open_is_said(tmp_path):
         read_volume(path)
 
 
-@pytest.mark.parametrize("encoding", ["raw", "gzip", "bzip2", "ASCII"])
+# ITK has no bzip2.
+@pytest.mark.parametrize("encoding", ["raw", "gzip", "ASCII"])
 @pytest.mark.parametrize("space", ["right-anterior-superior", "left-anterior-superior", "left-posterior-superior"])
 def test_nrrd_of_pynrrd_lies_where_itk_puts_it(tmp_path, encoding, space):
     header = {"space": space, "space directions": (TURN * [0.5, 1.25, 3]).T, "space origin": [1, 2, 3], "encoding": encoding}
@@ -143,11 +144,11 @@ def test_nifti_that_contradicts_itself_or_leaves_open(tmp_path):
     raw = bytearray((tmp_path / "a.nii").read_bytes())
     raw[80:92] = np.array([1, 1, 1], "<f4").tobytes()
     (tmp_path / "a.nii").write_bytes(raw)
-    with pytest.warns(UserWarning) as said:
+    with (
+        pytest.warns(UserWarning, match="pixdim says voxels of 1 x 1 x 1, the sform 2 x 2 x 2"),
+        pytest.warns(UserWarning, match="xyzt_units"),
+    ):
         volume = read_volume(tmp_path / "a.nii", time=2)
-    assert {"pixdim says", "xyzt_units"} <= {
-        words for words in ("pixdim says", "xyzt_units") if any(words in str(w.message) for w in said)
-    }
     np.testing.assert_array_equal(np.asarray(volume.values), voxels(*SHAPE, 4)[..., 2])
 
 

@@ -83,7 +83,8 @@ def _check_part(path: Path, fields: dict[str, bytes]) -> None:
         windows[name] = high_x - low_x + 1, high_y - low_y + 1
     if len(fields.get("compression", b"")) != 1 or not fields.get("channels"):
         raise _damaged(path, "it has no compression or channels")
-    check_pixels(path, "exr", *windows["dataWindow"], _bytes_each(path, fields["channels"]))
+    width, height = windows["dataWindow"]
+    check_pixels(path, "exr", width, height, _bytes_each(path, fields["channels"]))
     # A cropped picture may be far smaller than what it is framed by.
     width, height = windows["displayWindow"]
     if not (0 < width <= LARGEST and 0 < height <= LARGEST) or width * height > 2**30:
