@@ -2,7 +2,7 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all check clean
+.PHONY: demo test test-all fuzz check clean
 
 demo: $(VENV)/installed
 	$(BIN)/jvr demo -o jvr-demo --force
@@ -12,6 +12,12 @@ test: $(VENV)/installed-dev
 
 test-all: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m "" -n auto --dist loadfile
+
+# So many damaged files of each format.
+FUZZ ?= 100000
+
+fuzz: $(VENV)/installed-dev
+	$(BIN)/python tests/fuzz/parent.py $(FUZZ)
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff check .

@@ -182,7 +182,10 @@ def test_bad_nrrd_files(tmp_path):
     fails("cut short", nrrd(tmp_path / "e.nrrd", body, sizes="70000 70000 70000"))
     fails("damaged|cut short", nrrd(tmp_path / "f.nrrd", gzip.compress(body)[:50], encoding="gzip"))
     fails("sizes", nrrd(tmp_path / "g.nrrd", body, sizes="7 0 3"))
-    fails("2 components", nrrd(tmp_path / "h.nrrd", body * 2, dimension=4, sizes="2 7 5 3", kinds="vector domain domain domain"))
+    fails(
+        "2 channels; choose one with channel=",
+        nrrd(tmp_path / "h.nrrd", body * 2, dimension=4, sizes="2 7 5 3", kinds="vector domain domain domain"),
+    )
     fails("gone.raw", nrrd(tmp_path / "i.nhdr", b"", **{"data_file": "gone.raw"}))
 
 
@@ -249,8 +252,8 @@ def test_bad_nifti_files(tmp_path):
 
     good = nifti(voxels())
     fails("holds 200 bytes", written("a.nii", good[:-10]))
-    fails("gzip data", written("b.nii.gz", gzip.compress(good)[:-60]))
-    fails("holds 200", written("c.nii.gz", gzip.compress(good[:-10])))
+    fails("compressed data", written("b.nii.gz", gzip.compress(good)[:-60]))
+    fails("unpack to 200 bytes, the header announces 210", written("c.nii.gz", gzip.compress(good[:-10])))
     fails("looks like text", written("d.nii.gz", b"hello, this is a note"))
     fails("looks like gzip", written("e.nii", gzip.compress(good)))
     fails("not a gzip-compressed", written("f.nii.gz", good))
@@ -260,7 +263,10 @@ def test_bad_nifti_files(tmp_path):
     for bad in (0.0, -1.0, float("nan"), float("inf")):
         fails(r"pixdim\[2\]", written("j.nii", nifti(voxels(), pixdim=(1, bad, 1))))
     fails("cut short", written("k.nii.gz", gzip.compress(nifti(voxels(), dim=(3, 30000, 30000, 30000, 1, 1, 1, 1)))))
-    fails("4 axes", written("l.nii", nifti(np.stack([voxels()] * 2, -1), dim=(4, *SHAPE, 2, 1, 1, 1))))
+    fails(
+        "2 points in time; choose one with time=",
+        written("l.nii", nifti(np.stack([voxels()] * 2, -1), dim=(4, *SHAPE, 2, 1, 1, 1))),
+    )
     flipped = bytearray(gzip.compress(good))
     flipped[-6] ^= 1
     fails("damaged", written("m.nii.gz", bytes(flipped)))
@@ -307,7 +313,7 @@ def test_legacy_vtk_that_begins_with_vectors_or_holds_field_data(tmp_path):
     field += f"FIELD all 2\nzero 1 105 short\n{'0 ' * 105}\ndensity 1 105 short\n{numbers}\n"
     path.write_text(field)
     fails("choose one with array=: 'zero', 'density'", path)
-    fails("no scalar array 'mass'", path, array="mass")
+    fails("no array 'mass'; array= may be 'zero', 'density'", path, array="mass")
     assert_same(read_volume(path, array="density"), voxels())
     path.write_text(field[: len(field) // 2])
     fails("cut short", path)
@@ -640,16 +646,14 @@ def test_more_than_the_memory_is_refused_before_reading(tmp_path, monkeypatch):
 
 def test_nothing_is_printed_for_bad_files(tmp_path, capfd):
     path = metaimage(tmp_path / "a.mhd", voxels(), TransformMatrix="0 0 0 0 0 0 0 0 0")
-    fails("damaged or not supported", path)
+    fails("axes of length 0", path)
     fails("cut short", (lambda p: (p.write_text(p.read_text()[:-300]), p)[1])(vti(tmp_path / "a.vti", voxels())))
     captured = capfd.readouterr()
     assert captured.out + captured.err == ""
 
 
 def test_missing_extra_is_named(tmp_path, monkeypatch):
-    for name in ("vtkmodules.vtkIOXML", "zarr"):
-        monkeypatch.setitem(sys.modules, name, None)
-    fails(r"pip install 'jvr\[vtk\]'", vti(tmp_path / "a.vti", voxels()))
+    monkeypatch.setitem(sys.modules, "zarr", None)
     (tmp_path / "a.zarr").mkdir()
     fails(r"pip install 'jvr\[zarr\]'", tmp_path / "a.zarr")
 
@@ -725,4 +729,4 @@ def test_public_neghip_stack_is_the_slc_beside_it(data):
     assert len(slices) == 66
     for k, content in enumerate(slices):
         assert values[:, :, k].tobytes(order="F") == content
-    fails("unsupported extension '.slc'", data / "neghip/neghip.slc")
+    np.testing.assert_array_equal(np.asarray(read_volume(data / "neghip/neghip.slc").values), values)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from jvr.io.volumes.errors import SIGNATURES, available_memory, first_bytes, one_line
+from jvr.io.image_sizes import check_exr, check_pixels, check_radiance, sixteen_bits
+from jvr.io.volumes.errors import SIGNATURES, first_bytes, one_line
 from jvr.pictures import ImageError, Pixels, linear_from_srgb, quiet
 
 EXR, HDR, PNG, JPEG = b"\x76\x2f\x31\x01", b"#?", b"\x89PNG", b"\xff\xd8\xff"
@@ -50,14 +51,6 @@ def read_image(path: str | os.PathLike) -> Pixels:
     return _read_srgb(path, start) if reader is None else reader(path)
 
 
-def _fits_in_memory(path: Path, announced: int) -> None:
-    available = available_memory()
-    if available is not None and announced > available:
-        raise ImageError(
-            path, f"its {announced:,} bytes of pixels exceed the {available:,} bytes of free memory; crop or shrink it"
-        )
-
-
 def _kind(start: bytes) -> str:
     known = ((EXR, "an OpenEXR image"), (HDR, "a Radiance .hdr image"), (b"<!DOCTYPE", "a web page"), *SIGNATURES)
     printable = all(byte in b"\t\n\r" or byte >= 32 for byte in start)
@@ -68,6 +61,7 @@ def _kind(start: bytes) -> str:
 
 
 def _read_exr(path: Path) -> Pixels:
+    check_exr(path)
     with quiet():
         import OpenEXR
 
@@ -77,7 +71,6 @@ def _read_exr(path: Path) -> Pixels:
             raise ImageError(path, f"the OpenEXR header is damaged or cut short ({one_line(error)}); export it again") from error
     wanted = _colour_channels(path, header)
     low, high = _window(header["dataWindow"])
-    _fits_in_memory(path, int(np.prod(high - low)) * 4 * len(header["channels"]))
     with quiet():
         # OpenEXR says only on the terminal that pixels are missing, and then returns a file without parts.
         try:
@@ -124,6 +117,7 @@ def _framed(pixels: Pixels, corner: np.ndarray, low: np.ndarray, high: np.ndarra
 
 
 def _read_radiance(path: Path) -> Pixels:
+    check_radiance(path)
     import OpenImageIO
 
     file = OpenImageIO.ImageInput.open(str(path))
@@ -136,7 +130,6 @@ def _read_radiance(path: Path) -> Pixels:
         raise ImageError(path, f"its header states an exposure of {exposure}; it must be positive: correct it")
     if abs(gamma - 1) > 1e-3:
         raise ImageError(path, "its header states a GAMMA other than 1; export linear radiance")
-    _fits_in_memory(path, header.width * header.height * 3 * 4)
     pixels = file.read_image(OpenImageIO.FLOAT)
     if pixels is None:
         raise ImageError(path, f"the pixels are damaged or cut short ({one_line(file.geterror())}); copy or export it again")
@@ -150,9 +143,15 @@ def _read_radiance(path: Path) -> Pixels:
 
 
 def _read_srgb(path: Path, start: bytes) -> Pixels:
+    if start.startswith(PNG):
+        bits = start[24] * {2: 3, 4: 2, 6: 4}.get(start[25], 1) if len(start) > 25 else 0
+        width, height = (int.from_bytes(start[k : k + 4], "big") for k in (16, 20))
+        check_pixels(path, "png", width, height, bits / 8)
     try:
         # Pillow would silently drop the lower 8 of 16 bits of a colour PNG (depth and colour type are bytes 24 and 25).
-        code = _sixteen_bits(path) if start.startswith(PNG) and start[24] == 16 and start[25] != 0 else _eight_bits(path)
+        code = sixteen_bits(path) if start.startswith(PNG) and start[24] == 16 and start[25] != 0 else _eight_bits(path)
+    except ImageError:
+        raise
     except Exception as error:
         raise ImageError(path, f"the image is damaged or cut short ({one_line(error)}); copy or export it again") from error
     if code.ndim == 2:
@@ -167,7 +166,9 @@ def _eight_bits(path: Path) -> Float[np.ndarray, "..."]:
     """Codes 0 ... 1 of everything but colour with 16 bits."""
     from PIL import Image, ImageOps
 
-    with Image.open(path) as image:
+    # Of all that Pillow knows, some formats start other programs.
+    with Image.open(path, formats=("PNG", "JPEG", "MPO")) as image:
+        check_pixels(path, "jpeg", *image.size, 1)
         for guess in _guesses(image):
             warnings.warn(f"{path}: {guess}", stacklevel=4)
         image = ImageOps.exif_transpose(image)
@@ -187,10 +188,3 @@ def _guesses(image: Any) -> Iterator[str]:
         yield "carries a colour profile that is not sRGB, its codes are taken as sRGB; export it as sRGB"
     elif not profile and "srgb" not in image.info and abs(gamma * 2.2 - 1) > 0.02:
         yield f"states a gamma of 1 / {1 / gamma:.3g}, its codes are taken as sRGB; export it as sRGB"
-
-
-def _sixteen_bits(path: Path) -> Float[np.ndarray, "..."]:
-    import SimpleITK as sitk
-
-    with quiet():
-        return sitk.GetArrayFromImage(sitk.ReadImage(str(path))) / 65535.0

@@ -34,7 +34,8 @@ def blame(where: str, key: str) -> Iterator[None]:
         yield
     except ConfigError:
         raise
-    except (ValueError, TypeError) as error:
+    # A whole number of more than 32 or 64 bits is an OverflowError of NumPy.
+    except (ValueError, TypeError, OverflowError) as error:
         raise ConfigError(where, key, str(error)) from error
 
 

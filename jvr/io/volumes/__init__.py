@@ -16,12 +16,15 @@ from jvr.io.volumes.arrays import read_npy, read_raw
 from jvr.io.volumes.dicom import looks_like_dicom, read_dicom_file, read_dicom_folder
 from jvr.io.volumes.errors import VolumeError, first_bytes
 from jvr.io.volumes.given import Given
-from jvr.io.volumes.itk import read_metaimage, read_nrrd
+from jvr.io.volumes.metaimage import read_metaimage
 from jvr.io.volumes.nifti import read_nifti
+from jvr.io.volumes.nrrd import read_nrrd
+from jvr.io.volumes.slc import read_slc
 from jvr.io.volumes.slices import is_slices, read_slices
 from jvr.io.volumes.stored import Stored, replaced, to_volume
 from jvr.io.volumes.tiff import read_tiff
-from jvr.io.volumes.vtk_files import read_legacy_vtk, read_vti
+from jvr.io.volumes.vtk_legacy import read_legacy_vtk
+from jvr.io.volumes.vtk_xml import read_vti
 from jvr.io.volumes.zarr_files import is_zarr, read_zarr
 from jvr.model.volume import Volume
 
@@ -32,15 +35,20 @@ Numbers = float | int | Sequence[float | int] | np.ndarray
 RAW = (".raw", ".bin", ".dat")
 # For each ending: the reader and the keywords of `read_volume` that it takes, beside those that place and scale every volume.
 READERS: dict[str, tuple[Callable[[Path, Given], Stored], tuple[str, ...]]] = {
-    ".mhd": (read_metaimage, ()),
-    ".mha": (read_metaimage, ()),
-    ".nrrd": (read_nrrd, ()),
-    ".nhdr": (read_nrrd, ()),
-    ".nii": (read_nifti, ()),
-    ".nii.gz": (read_nifti, ()),
+    ".mhd": (read_metaimage, ("channel", "time")),
+    ".mha": (read_metaimage, ("channel", "time")),
+    ".nrrd": (read_nrrd, ("channel", "time")),
+    ".nhdr": (read_nrrd, ("channel", "time")),
+    ".nii": (read_nifti, ("channel", "time")),
+    ".nii.gz": (read_nifti, ("channel", "time")),
+    ".hdr": (read_nifti, ("channel", "time")),
+    ".hdr.gz": (read_nifti, ("channel", "time")),
+    ".img": (read_nifti, ("channel", "time")),
+    ".img.gz": (read_nifti, ("channel", "time")),
     ".dcm": (read_dicom_file, ("channel", "time")),
-    ".vtk": (read_legacy_vtk, ("array",)),
-    ".vti": (read_vti, ("array",)),
+    ".vtk": (read_legacy_vtk, ("array", "channel")),
+    ".vti": (read_vti, ("array", "channel")),
+    ".slc": (read_slc, ()),
     ".tif": (read_tiff, ("array", "axes", "channel", "time")),
     ".tiff": (read_tiff, ("array", "axes", "channel", "time")),
     ".npy": (read_npy, ("axes", "channel", "time")),
@@ -173,9 +181,8 @@ def _direction(path: Path, matrix: Any) -> np.ndarray | None:
 def _reader(path: Path, *, raw: bool) -> tuple[Callable[[Path, Given], Stored], tuple[str, ...]]:
     """The reader for a name, and the keywords it takes."""
     name = path.name.lower()
-    ending = next(
-        (ending for ending in (".nii.gz", ".zarr.zip", path.suffix.lower()) if name.endswith(ending) and ending in READERS), None
-    )
+    endings = ("".join(path.suffixes[-2:]).lower(), path.suffix.lower())
+    ending = next((ending for ending in endings if ending in READERS), None)
     if path.is_dir():
         if ending == ".zarr" or is_zarr(path):
             return READERS[".zarr"]
@@ -183,7 +190,8 @@ def _reader(path: Path, *, raw: bool) -> tuple[Callable[[Path, Given], Stored], 
     first_bytes(path, 1)
     if ending == ".zarr":
         raise VolumeError(path, "a Zarr is a folder, this is a file; unpack it first")
-    if ending is not None:
+    # An .img may be headerless too.
+    if ending is not None and not (raw and ending == ".img"):
         return READERS[ending]
     if raw:
         return read_raw, ("shape", "dtype")

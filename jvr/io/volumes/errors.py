@@ -44,6 +44,9 @@ def first_bytes(path: Path, count: int = 65536) -> bytes:
         folder = os.listdir(path.parent) if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, folder, 1, 0.6)
         raise FileNotFoundError(f"{path}: no such file" + (f"; did you mean {near[0]!r}?" if near else ""))
+    # A pipe or a device may never end.
+    if not path.is_file():
+        raise VolumeError(path, "this is no ordinary file; give the name of one")
     with path.open("rb") as file:
         start = file.read(count)
     if not start:

@@ -1,25 +1,25 @@
-"""NIfTI: SimpleITK says where the voxels lie, the voxels themselves are read here.
-
-ITK turns integers with a slope into doubles, and fills up a file that was cut short without a word.
-"""
+"""NIfTI-1 and NIfTI-2, one file or a pair of header and image, after https://nifti.nimh.nih.gov/nifti-1 and nifti-2."""
 
 import dataclasses
-import gzip
 import math
+import re
 import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
 
-from jvr.io.volumes.errors import VolumeError, check_size, first_bytes, grid_numbers, mislabelled, one_line, three_axes
+from jvr.io.volumes import payload
+from jvr.io.volumes.axes import chosen
+from jvr.io.volumes.directions import check_volume, completed
+from jvr.io.volumes.errors import VolumeError, check_size, first_bytes, grid_numbers, mislabelled
 from jvr.io.volumes.given import Given
-from jvr.io.volumes.itk import affine_of_image, silenced
 from jvr.io.volumes.stored import Stored
+from jvr.io.volumes.units import millimetres
 
 TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8"}
 NOT_SCALAR = {32: "complex numbers", 1792: "complex numbers", 128: "RGB colours", 2304: "RGBA colours"}
-MILLIMETRES = {1: 1000.0, 2: 1.0, 3: 0.001}
+UNITS = {0: "", 1: "m", 2: "mm", 3: "um"}
+GZIP = b"\x1f\x8b"
 
 
 @dataclasses.dataclass
@@ -31,40 +31,56 @@ class _Header:
     offset: int
     slope: float
     intercept: float
+    qform: tuple[float, ...] | None
     sform: np.ndarray | None
     units: int
+    alone: bool
 
 
 def read_nifti(path: Path, given: Given) -> Stored:
-    """A NIfTI-1 or NIfTI-2 file, plain or gzipped. Integers stay as stored, their slope and intercept beside them."""
+    """A NIfTI file, plain or gzipped. Integers stay as stored, their slope and intercept beside them; `time` and `channel` (dim[5]) choose.
+
+    Voxels lie where the sform says, or else the qform, or else one behind the other by pixdim.
+    """
+    name = path.name.lower()
     start = first_bytes(path, 1024)
-    zipped = path.name.lower().endswith(".gz")
-    if zipped != start.startswith(b"\x1f\x8b"):
-        wanted = "a gzip-compressed NIfTI file (.nii.gz)" if zipped else "a NIfTI file (.nii)"
-        raise mislabelled(path, start, wanted)
+    if (image := re.search(r"\.img(\.gz)?$", name)) is not None:
+        return read_nifti(_sibling(path, image[0], "hdr"), given)
+    zipped = name.endswith(".gz")
+    if zipped != start.startswith(GZIP):
+        raise mislabelled(path, start, "a gzip-compressed NIfTI file (.nii.gz)" if zipped else "a NIfTI file (.nii)")
     header = _header(path, _unzipped_start(path) if zipped else start)
-    shape = three_axes(path, header.dim)
-    for axis, (size, n) in enumerate(zip(header.pixdim, shape, strict=False)):
-        if n > 1:
-            grid_numbers(path, f"pixdim[{axis + 1}]", [f"{size:g}"], positive=True)
     if header.datatype not in TYPES:
         kind = NOT_SCALAR.get(header.datatype, "not supported")
         raise VolumeError(path, f"the voxels are {kind} (NIfTI data type {header.datatype}); save them as one real number each")
-    dtype = np.dtype(header.order + TYPES[header.datatype])
-    file_bytes = path.stat().st_size
-    check_size(path, shape, dtype.itemsize, file_bytes if zipped else file_bytes - header.offset, compressed=zipped)
-    voxels = _voxels(path, header.offset, math.prod(shape) * dtype.itemsize, zipped).view(dtype).reshape(shape, order="F")
+    of_all = chosen(path, header.dim, ("x", "y", "z", "t", "c", "dim[6]", "dim[7]")[: len(header.dim)], given)
+    affine = _affine(path, header, given)
+    file = path if header.alone else _sibling(path, re.search(r"\.hdr(\.gz)?$|$", name)[0], "img")  # type: ignore[index]
+    values = _values(path, file, header).reshape(header.dim, order="F")
     scaled = math.isfinite(header.slope) and header.slope != 0
     slope, intercept = (header.slope, header.intercept) if scaled else (1.0, 0.0)
-    return Stored(voxels, _affine(path, header), slope, intercept)
+    return Stored(of_all.of(values), affine, slope, intercept)
+
+
+def _sibling(path: Path, ending: str, other: str) -> Path:
+    """The other file of a pair: the same name with `hdr` or `img`, in the case of letters that is there."""
+    stem = path.name[: len(path.name) - len(ending)] if ending else path.stem
+    zipped = ending.lower().endswith(".gz")
+    for name in (f"{other}.gz" if zipped else other, other.upper(), other, f"{other}.gz"):
+        if (path.parent / f"{stem}.{name}").is_file():
+            return path.parent / f"{stem}.{name}"
+    raise VolumeError(path, f"the pair of header and image lacks '{stem}.{other}', which must lie beside it")
 
 
 def _unzipped_start(path: Path) -> bytes:
-    try:
-        with gzip.open(path) as file:
-            return file.read(1024)
-    except (EOFError, OSError, zlib.error) as error:
-        raise VolumeError(path, f"the gzip data are damaged ({one_line(error)}); copy or export the file again") from None
+    """The first bytes of a gzip file that may be shorter."""
+    # Longer than a header and shorter than the voxels of any file that is read.
+    for count in (540, 348):
+        try:
+            return payload.unpacked(path, payload.pieces_of(path), "gzip", count, quiet=True).tobytes()
+        except VolumeError as error:
+            problem = error
+    raise problem
 
 
 def _header(path: Path, start: bytes) -> _Header:
@@ -74,57 +90,104 @@ def _header(path: Path, start: bytes) -> _Header:
     order, size = sizes[start[:4]]
     at = lambda kinds, offset: struct.unpack_from(order + kinds, start, offset)
     magic = start[344:348] if size == 348 else start[4:8]
-    if not magic.startswith((b"n+1", b"n+2")):
-        raise VolumeError(path, "its header is that of an .hdr/.img pair or of Analyze 7.5; convert it to a single .nii file")
+    if not magic.startswith((b"n+1", b"n+2", b"ni1", b"ni2")):
+        raise VolumeError(
+            path, "its header is that of Analyze 7.5, which does not say where left is; convert it to a single .nii file"
+        )
     if size == 348:
         dim, pixdim, (datatype,) = at("8h", 40), at("8f", 76), at("h", 70)
         offset, slope, intercept = at("3f", 108)
-        (sform_code,), srow, units = at("h", 254), at("12f", 280), start[123]
+        (qform_code, sform_code), quaternion, srow, units = at("2h", 252), at("6f", 256), at("12f", 280), start[123]
     else:
         dim, pixdim, (datatype,) = at("8q", 16), at("8d", 104), at("h", 12)
-        (offset,), (slope, intercept), (sform_code,), srow = at("q", 168), at("2d", 176), at("i", 348), at("12d", 400)
-        units = at("i", 500)[0]
-    if not 1 <= dim[0] <= 7 or min(dim[1 : dim[0] + 1]) < 1 or not size <= offset < 2**40:
+        (offset,), (slope, intercept), (qform_code, sform_code) = at("q", 168), at("2d", 176), at("2i", 344)
+        quaternion, srow, units = at("6d", 352), at("12d", 400), at("i", 500)[0]
+    alone = magic.startswith(b"n+")
+    # Zeros stand for axes that a file does not use, also within the number of axes that it states.
+    used = tuple(max(n, 1) if k >= 3 and n == 0 else n for k, n in enumerate(dim[1 : dim[0] + 1]))
+    if not 1 <= dim[0] <= 7 or min(used) < 1 or not (size if alone else 0) <= offset < 2**40:
         raise VolumeError(
             path, f"the header is damaged: dim is {dim}, the voxels begin at byte {offset:g}; export the file again"
         )
     sform = np.reshape(srow, (3, 4)).astype(float) if sform_code > 0 else None
-    return _Header(dim[1 : dim[0] + 1], pixdim[1:], datatype, order, int(offset), slope, intercept, sform, units & 7)
+    qform = quaternion if qform_code > 0 else None
+    return _Header(used, pixdim, datatype, order, int(offset), slope, intercept, qform, sform, units & 7, alone)
 
 
-def _voxels(path: Path, offset: int, count: int, zipped: bool) -> np.ndarray:
-    """Exactly `count` bytes from `offset` on."""
-    buffer = np.empty(count, np.uint8)
-    view, filled = buffer.data, 0
-    try:
-        with gzip.open(path) if zipped else path.open("rb") as file:
-            file.seek(offset)
-            while filled < count and (got := file.readinto(view[filled:])):
-                filled += got
-            # The checksum of a gzip file is verified where the file ends.
-            file.read(1)
-    except (EOFError, OSError, zlib.error) as error:
-        problem = f"the gzip data end early or are damaged ({one_line(error)}), after {filled:,} of {count:,} bytes"
-        raise VolumeError(path, f"{problem}; copy or export the file again") from None
-    if filled < count:
-        raise VolumeError(path, f"the header announces {count:,} bytes of voxels, the file holds {filled:,}: it is cut short")
-    return buffer
+def _values(path: Path, file: Path, header: _Header) -> np.ndarray:
+    dtype = np.dtype(header.order + TYPES[header.datatype])
+    zipped = first_bytes(file, 2) == GZIP
+    count, stored = math.prod(header.dim) * dtype.itemsize, file.stat().st_size
+    check_size(path, header.dim, dtype.itemsize, stored if zipped else stored - header.offset, compressed=zipped)
+    if not zipped:
+        return payload.slabs(path, [file], [header.offset], count).view(dtype)
+    if header.offset > payload.MOST_SKIPPED:
+        raise VolumeError(
+            path, f"the voxels begin at byte {header.offset:,} behind a header of 348 or 540: export the file again"
+        )
+    return payload.unpacked(path, payload.pieces_of(file), "gzip", count, header.offset).view(dtype)
 
 
-def _affine(path: Path, header: _Header) -> np.ndarray:
-    """Where ITK puts the voxels; a sheared sform, which ITK refuses, as the file states it."""
-    import SimpleITK as sitk
+# --- Where the voxels lie --------------------------------------------------------------------------------------------
 
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
-    reader.SetImageIO("NiftiImageIO")
-    try:
-        with silenced():
-            reader.ReadImageInformation()
-        return affine_of_image(reader)
-    except RuntimeError as error:
-        if header.sform is None or "orthonormal" not in str(error):
-            raise VolumeError(path, f"damaged or not supported: {one_line(error)}") from None
-    scale = MILLIMETRES.get(header.units, 1.0)
-    # NIfTI's world is RAS.
-    return np.vstack([np.diag([-scale, -scale, scale]) @ header.sform, [0, 0, 0, 1]])
+
+def _affine(path: Path, header: _Header, given: Given) -> np.ndarray:
+    """LPS, in millimetres; NIfTI's world is RAS."""
+    n = min(len(header.dim), 3)
+    sizes = [1.0, 1.0, 1.0]
+    if given.spacing is None:
+        for axis in range(n):
+            if header.dim[axis] > 1:
+                size = f"{header.pixdim[axis + 1]:g}"
+                sizes[axis] = grid_numbers(path, f"pixdim[{axis + 1}]", [size], positive=True)[0] and header.pixdim[axis + 1]
+    unit = 1.0
+    if given.spacing is None or given.origin is None:
+        unit = millimetres(path, "xyzt_units", UNITS.get(header.units, f"code {header.units}"))
+    matrix = np.eye(4)
+    if given.spacing is not None and given.direction is not None:
+        placed = None
+    elif header.sform is not None:
+        placed = header.sform
+        _compare(path, header, sizes, given)
+    else:
+        placed = None if header.qform is None else _of_quaternion(header, sizes)
+    if placed is None:
+        if given.direction is None:
+            payload.said(
+                path, "neither sform nor qform says where the voxels lie: the axes are taken for LPS; else give direction="
+            )
+        matrix[:3, :3] = np.diag(sizes) * unit
+        return matrix
+    lps = unit * np.diag([-1, -1, 1]) @ placed
+    if not np.isfinite(lps).all():
+        raise VolumeError(path, "its sform or qform is not finite: export the file again, or give spacing= and direction=")
+    matrix[:3, :3], matrix[:3, 3] = completed(lps[:, :3]), lps[:, 3]
+    check_volume(path, "sform" if header.sform is not None else "qform", matrix[:3, :3])
+    return matrix
+
+
+def _of_quaternion(header: _Header, sizes: list[float]) -> np.ndarray:
+    """Method 2 of NIfTI: a rotation by the quaternion (a, b, c, d), the third axis turned around where pixdim[0] (qfac) is negative."""
+    b, c, d, *origin = header.qform or (0.0,) * 6
+    square = b * b + c * c + d * d
+    if square > 1:
+        b, c, d = (x / math.sqrt(square) for x in (b, c, d))
+    a = math.sqrt(max(1 - square, 0))
+    turn = [
+        [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
+        [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
+        [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
+    ]
+    signs = [1, 1, -1 if header.pixdim[0] < 0 else 1]
+    return np.column_stack([np.array(turn) * sizes * signs, origin])
+
+
+def _compare(path: Path, header: _Header, sizes: list[float], given: Given) -> None:
+    """Says where pixdim and the sform give the voxel other sizes."""
+    lengths = np.linalg.norm(header.sform[:, :3], axis=0) if header.sform is not None else np.array(sizes)
+    axes = [axis for axis in range(min(len(header.dim), 3)) if header.dim[axis] > 1]
+    if given.spacing is None and any(abs(lengths[k] - sizes[k]) > 1e-2 * sizes[k] for k in axes):
+        stated, found = (" x ".join(f"{x[k]:.4g}" for k in axes) for x in (sizes, lengths))
+        payload.said(
+            path, f"pixdim says voxels of {stated}, the sform {found}; the sform is taken (give spacing= where it is wrong)"
+        )

@@ -27,8 +27,6 @@ class Stored:
     intercept: float = 0.0
     missing: float | None = None
     unit: str = ""
-    # Whose memory `values` looks into: a view of a SimpleITK image does not keep the image alive.
-    owner: Any = None
 
 
 def affine_of(spacing: Any, origin: Any = (0, 0, 0), direction: Any = None) -> np.ndarray:
