@@ -19,7 +19,7 @@ MOST_HEADER = 1 << 22
 LARGEST = 1 << 20
 
 
-def check_pixels(path: Path, kind: str, width: int, height: int, bytes_each: float) -> None:
+def check_pixels(path: Path, kind: str, width: int, height: int, bytes_each: float | int) -> None:
     """**Raises** `ImageError` for pixels that the file cannot hold, or the memory cannot take."""
     announced, stored = int(width * height * bytes_each), path.stat().st_size
     size = f"{width:,} x {height:,} pixels"
