@@ -111,7 +111,7 @@ def test_bad_radiance_files_get_one_line(tmp_path, capfd):
 
 
 def test_announced_pixels_must_fit_in_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr("jvr.io.images.available_memory", lambda: 1000)
+    monkeypatch.setattr("jvr.io.image_sizes.available_memory", lambda: 1000)
     fails("exceed the 1,000 bytes of free memory", read_image, radiance_file(tmp_path / "a.hdr", np.zeros((10, 20, 4))))
 
 

@@ -72,11 +72,12 @@ class OwnShadow(eqx.Module):
 
 
 def own_shadow_of(scene: Scene) -> OwnShadow | None:
-    """The shadow that surfaces cast on themselves, where light of nodes arrives at them."""
+    """The shadow that surfaces cast on themselves, where light of nodes arrives at them; with the transfer function that the nodes know."""
     if scene.radiance_transfer is None or scene.material is None or not scene.material.needs_gradient:
         return None
     width = scene.radiance_transfer.lift(scene.volume)
-    return OwnShadow(scene.transfer, width, scene.normals.of_opacity, scene.radiance_transfer.bleeding is not None)
+    transfer = scene.radiance_transfer.transfer_function(scene)
+    return OwnShadow(transfer, width, scene.normals.of_opacity, scene.radiance_transfer.bleeding is not None)
 
 
 def _ramp(sigma: Scalar, slope: Scalar, width: Scalar) -> Scalar:

@@ -60,6 +60,7 @@ class ProjectedTransfer(eqx.Module):
     - `chroma`: `(x, y, z, 2, fewer bands)` holds orange-blue and green-purple differences (YCoCg); else `None`.
     - `solid`: `(x, y, z)`, how much of an opaque surface there is, from above 0 to 1; 0 where nothing is near and nothing was projected.
     - `facing`: `(x, y, z, 3)`, the unit vector away from the medium, shorter where that has hardly a direction.
+    - `transfer`: the transfer function of that time, which the shadow of surfaces on themselves is found with.
     - `made_for`: checksums of what it was made of (`jvr.model.kept.content`).
     - `scattered`: whether the scattering pass has been made.
     - `pinned`: whether it stays as it is although the scene is another.
@@ -69,6 +70,7 @@ class ProjectedTransfer(eqx.Module):
     chroma: Float[Array, "x y z 2 fewer"] | None
     solid: Float[Array, "x y z"]
     facing: Float[Array, "x y z 3"]
+    transfer: AbstractTransfer
     made_for: UInt32[Array, "parts 2"]
     scattered: bool = eqx.field(static=True, default=False)
     pinned: bool = eqx.field(static=True, default=False)
@@ -242,6 +244,9 @@ class RadianceTransfer(AbstractRadianceTransfer):
     @property
     def is_frozen(self) -> bool:
         return self.projected is not None
+
+    def transfer_function(self, scene: Any) -> AbstractTransfer:
+        return scene.transfer if self.projected is None else self.projected.transfer
 
     @property
     def is_final(self) -> bool:

@@ -167,7 +167,7 @@ def finished(
     shape = transfer.shape(scene.volume)
     made_for = jnp.asarray(transfer.made_for(scene))
     grid, around = coefficients.reshape(*shape, *coefficients.shape[1:]), around.reshape(*shape, 4)
-    projected = ProjectedTransfer(grid, None, around[..., 0], around[..., 1:], made_for)
+    projected = ProjectedTransfer(grid, None, around[..., 0], around[..., 1:], scene.transfer, made_for)
     projected = projected if transfer.scattering is None else scattered(scene, projected)
     return projected if transfer.chromaticity is None else _separated(projected, transfer.chromaticity)
 

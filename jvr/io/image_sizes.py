@@ -24,13 +24,12 @@ def check_pixels(path: Path, kind: str, width: int, height: int, bytes_each: flo
     announced, stored = int(width * height * bytes_each), path.stat().st_size
     size = f"{width:,} x {height:,} pixels"
     if not (0 < width <= LARGEST and 0 < height <= LARGEST) or announced > stored * TIGHTEST[kind]:
-        problem = f"the header announces {size}, which {stored:,} bytes of file cannot hold"
-        raise ImageError(path, f"{problem}: it is damaged or cut short; copy or export it again")
-    available = available_memory()
-    if available is not None and announced > available:
-        raise ImageError(
-            path, f"its {announced:,} bytes of pixels exceed the {available:,} bytes of free memory; crop or shrink it"
-        )
+        problem = f"the header is damaged or the file cut short: {stored:,} bytes cannot hold {size}"
+        raise ImageError(path, f"{problem}; copy or export it again")
+    # In memory a pixel is three float32 at least.
+    needed, available = int(width * height * max(bytes_each, 12)), available_memory()
+    if available is not None and needed > available:
+        raise ImageError(path, f"its {needed:,} bytes of pixels exceed the {available:,} bytes of free memory; crop or shrink it")
 
 
 def check_radiance(path: Path) -> None:

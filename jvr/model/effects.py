@@ -100,6 +100,10 @@ class AbstractRadianceTransfer(eqx.Module):
         """Whether a picture has nothing left to do but to multiply it with the light."""
 
     @abc.abstractmethod
+    def transfer_function(self, scene: Any) -> Any:
+        """The transfer function that it knows: that of the scene, or of the time when it was computed."""
+
+    @abc.abstractmethod
     def lift(self, volume: Any) -> Scalar:
         """How far above a surface, in the world, it is known what arrives."""
 
