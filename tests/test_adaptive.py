@@ -204,10 +204,12 @@ def test_nothing_is_wanted_where_nothing_changes():
 
 
 def test_everything_is_wanted_where_a_voxel_is_no_number():
-    values = np.full((9, 8, 7), 0.4)
-    values[4, 4, 4] = np.nan
+    """A voxel that a fit has made so."""
+    volume = jvr.Volume(np.full((9, 8, 7), 0.4))
+    volume = eqx.tree_at(lambda v: v.values, volume, volume.values.at[4, 4, 4].set(jnp.nan))
     for oracle in ORACLES:
-        assert np.min(field(oracle(1e-6), values, linear_transfer())) == 0
+        found = ask(oracle(1e-6), volume, linear_transfer(), jvr.EmissionAbsorption(), jnp.asarray(100.0))
+        assert np.min(found.distance) == 0
 
 
 def test_the_distance_to_a_change_of_opacity():

@@ -353,6 +353,7 @@ def test_a_lit_configuration_renders():
     assert float(picture.rgb.max()) > 0.0
 
 
+@pytest.mark.slow
 def test_the_examples_of_the_documentation_are_valid():
     text = (Path(__file__).parents[1] / "docs" / "files.md").read_text(encoding="utf-8")
     lit, fit = (block.split("```")[0] for block in text.split("```toml\n")[1:])

@@ -432,6 +432,7 @@ def test_residuals_are_rendered_minus_target():
     assert [part.shape for part in parts] == [(15, 16, 3), (3, 4, 3)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of", ["colours", pytest.param("voxels", marks=pytest.mark.slow)])
 def test_a_fit_leaps_over_what_has_no_derivative(of):
     """Mostly empty at the start: the same iterations with leaps and without."""

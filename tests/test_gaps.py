@@ -48,10 +48,12 @@ def test_nearest_voxels_are_empty_where_they_are_missing():
     np.testing.assert_allclose(found.alpha[0, 0], 1 - np.exp(-DEPTH * (N - 1 - 1)), rtol=1e-5)
 
 
-SLOWER = [pytest.param(n, marks=pytest.mark.slow) for n in (jvr.SobelDifferences(), jvr.PrecomputedGradient())]
+SLOWER = [
+    pytest.param(n, marks=pytest.mark.slow) for n in (jvr.CentralDifferences(), jvr.SobelDifferences(), jvr.PrecomputedGradient())
+]
 
 
-@pytest.mark.parametrize("normals", [jvr.AnalyticGradient(), jvr.CentralDifferences(), *SLOWER])
+@pytest.mark.parametrize("normals", [jvr.AnalyticGradient(), *SLOWER])
 def test_there_is_no_shell_around_what_is_missing(normals):
     """The gradient of a ramp is that of the ramp up to the edge of the data: what is left of it is lit alike everywhere."""
     ramp = np.broadcast_to(np.linspace(0, 1, N, dtype=np.float32)[:, None, None], (N,) * 3).copy()
@@ -94,7 +96,9 @@ TABLE = jvr.LinearTransfer([0.0, 0.4, 1.0], [[0.9, 0.5, 0.1], [0.2, 0.8, 0.3], [
 EYES = jvr.PerspectiveCamera.look_at([9.0, 13.0, -14.0], [4.0, 4.0, 4.0], [0.0, 1.0, 0.0], fov_y=40.0, width=9, height=9)
 
 
-@pytest.mark.parametrize("adjoint", [jvr.Replay(), jvr.Rows(), pytest.param(jvr.Forward(), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "adjoint", [jvr.Replay(), *(pytest.param(a, marks=pytest.mark.slow) for a in (jvr.Rows(), jvr.Forward()))]
+)
 def test_derivatives_are_those_of_differences(adjoint, x64):
     values = np.array(smooth().values, np.float64)
     values[np.asarray(smooth().gaps) & 1 > 0] = np.nan
@@ -134,6 +138,7 @@ def test_every_derivative_is_finite_and_missing_voxels_have_none(x64):
         np.testing.assert_allclose(part(float_of), (loss(move(h)) - loss(move(-h))) / (2 * h), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_fits_with_kept_samples_know_of_gaps():
     scene = jvr.Scene(smooth(), TABLE)
     images = [np.asarray(jvr.render(scene, EYES, jvr.Settings(step=0.5)).rgb)]
@@ -180,6 +185,7 @@ def test_a_range_has_all_that_is_more_than_a_few():
     assert typical_range(np.array([0.0, 1.0])) == (0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_a_fit_is_as_good_with_a_hot_voxel():
     settings = jvr.Settings(step=0.5)
     errors = []

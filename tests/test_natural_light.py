@@ -384,6 +384,7 @@ def test_what_is_refused_is_computed_again_or_pinned(tmp_path):
     assert np.abs(shown - picture(changed)).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_single_voxels_and_opaque_insides_have_no_nan():
     for shape in ((1, 1, 1), (1, 4, 4)):
         lit = scene(transfer=jvr.RadianceTransfer(rays=8), shape=shape)

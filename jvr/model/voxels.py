@@ -85,7 +85,7 @@ def without_gaps(
     if voxels is None or (missing is None and not is_float):
         return values, None
     absent = np.isnan(voxels) if is_float else np.zeros(voxels.shape, bool)
-    if is_float and (count := np.count_nonzero(huge := np.abs(voxels) >= HUGE)):
+    if is_float and (count := np.count_nonzero(huge := (np.abs(voxels) >= HUGE) & np.isfinite(voxels))):
         if missing is None or abs(missing) < HUGE:
             warnings.warn(f"{count:,} voxels lie beyond 1e30: they count as missing data and stay empty", stacklevel=4)
         absent |= huge
