@@ -74,10 +74,7 @@ def _facing(volume: Volume) -> dict[str, str]:
 def what_is_seen(volume: Volume, transfer: AbstractTransfer) -> str | None:
     """A line where a transfer function shows nothing of a volume, or all of it, with the range that would show something."""
     data = _subset(volume)
-    sigma_t = np.asarray(
-        jax.vmap(lambda s: jnp.asarray(transfer.evaluate(s, jnp.zeros_like(s)).sigma_t).max())(jnp.asarray(data))
-    )
-    share = float(np.mean(sigma_t > 0))
+    share = float(_share_seen(transfer, jnp.asarray(data, jnp.result_type(float))))
     if 0 < share < 0.98 or transfer.takes_gradient:
         return None
     low, high = contents(volume)
