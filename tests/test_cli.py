@@ -228,8 +228,9 @@ def test_an_interrupted_fit_goes_on_to_the_same_answer(tmp_path, capfd, monkeypa
 
     _folder_of_a_fit(tmp_path / "whole", whole)
     before = snapshot(tmp_path)
+    # The targets are rendered with the settings, too.
     assert cli.run(["fit", "fit.toml", "-o", "whole", "--resume", "--set", "settings.step=0.9"]) == 2
-    assert "checkpoint.npz: is of another fit (settings changed since)" in capfd.readouterr().err
+    assert "checkpoint.npz: is of another fit (images, settings changed since)" in capfd.readouterr().err
     assert snapshot(tmp_path) == before
 
 
