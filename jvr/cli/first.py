@@ -36,7 +36,7 @@ def configured(given: Path, sets: list[str], keywords: dict[str, Any], wishes: W
     volume = build_volume(load(given, [text for text in sets if text.startswith("volume.")], keywords))
     tables, notes = first_picture(volume, given, wishes.preset, lit=wishes.lit is not False)
     tables["volume"] = {"path": str(given.absolute()), **keywords, **tables.get("volume", {})}
-    tables["background"] = _colour(wishes.background or "black")
+    tables["background"] = [0.0, 0.0, 0.0] if wishes.background is None else _colour(wishes.background)
     tables["camera"] = _camera(wishes, tables["camera"])
     config = config_from(tables, str(given), given.parent, sets)
     return config, interpolated(config, volume), notes
