@@ -62,19 +62,17 @@ def usage_problem(error: Any) -> str:
     return f"{error.format_message().rstrip('.')}; see {command} --help"
 
 
-def load(
-    given: Path, sets: Sequence[str], volume: dict[str, Any] | None = None, transfer: dict[str, Any] | None = None
-) -> "Config":
+def load(given: Path, sets: Sequence[str], volume: dict[str, Any] | None = None) -> "Config":
     """The configuration of a TOML file, or one made up for a volume file that is named directly."""
     from jvr.io.config import config_from, read_config
 
     if given.suffix.lower() == ".toml":
-        if refused := [f"--{key.replace('_', '-')}" for key in (volume or {})] + (["--preset"] if transfer else []):
+        if refused := [f"--{key.replace('_', '-')}" for key in (volume or {})]:
             raise BadInput(f"{refused[0]} is for a volume file; for a configuration use --set")
         return read_config(given, sets)
     if not given.exists():
         raise BadInput(f"{given}: no such file; give a configuration (.toml) or a volume")
-    data = {"volume": {"path": str(given.absolute()), **(volume or {})}, "transfer": transfer or {"kind": "window"}}
+    data = {"volume": {"path": str(given.absolute()), **(volume or {})}, "transfer": {"kind": "window"}}
     data["background"] = [0.0, 0.0, 0.0]
     return config_from(data, str(given), given.parent, sets)
 

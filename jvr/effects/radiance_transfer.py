@@ -279,7 +279,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
     def made_for(self, scene: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
         """Checksums of all that a projection depends on."""
         volume = scene.volume
-        parts = [volume.values, volume.slope, volume.intercept, volume.world_from_grid, volume.interpolation]
+        parts = [volume.values, volume.gaps, volume.slope, volume.intercept, volume.world_from_grid, volume.interpolation]
         parts += [scene.transfer, scene.clipping, scene.normals if self.needs_gradient or scene.transfer.takes_gradient else None]
         parts.append(scene.material if self.needs_gradient else None)
         # Above a surface rays begin in front of it.
