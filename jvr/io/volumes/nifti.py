@@ -55,7 +55,8 @@ def read_nifti(path: Path, given: Given) -> Stored:
         raise VolumeError(path, f"the voxels are {kind} (NIfTI data type {header.datatype}); save them as one real number each")
     of_all = chosen(path, header.dim, ("x", "y", "z", "t", "c", "dim[6]", "dim[7]")[: len(header.dim)], given)
     affine = _affine(path, header, given)
-    file = path if header.alone else _sibling(path, re.search(r"\.hdr(\.gz)?$|$", name)[0], "img")  # type: ignore[index]
+    ending = next((end for end in (".hdr", ".hdr.gz") if name.endswith(end)), "")
+    file = path if header.alone else _sibling(path, ending, "img")
     values = _values(path, file, header).reshape(header.dim, order="F")
     scaled = math.isfinite(header.slope) and header.slope != 0
     slope, intercept = (header.slope, header.intercept) if scaled else (1.0, 0.0)
