@@ -36,6 +36,7 @@ def main() -> None:
     unknown = set(arguments.names) - set(names)
     if unknown:
         parser.error(f"unknown benchmark {', '.join(sorted(unknown))}: choose from {', '.join(names)}")
+    jvr.use_all_cores()
     result = {"machine": machine()}
     default = [*CASES, "peers"] if jax.default_backend() == "cpu" else [*CASES, "peers", "accelerator"]
     for name in arguments.names or default:

@@ -20,7 +20,7 @@ import jvr
 from benchmarks import scenes
 from benchmarks.peers.compiled import compiler
 from benchmarks.timing import median, seconds
-from jvr.rendering.parts import all_blocks, picture_of, pixels_of
+from jvr.execution.tiles import dealt_blocks, picture_of, pixels_of
 from jvr.rendering.trace import aim, seen
 
 SOURCE = Path(__file__).with_name("march.cu")
@@ -48,7 +48,7 @@ class HandWritten:
         self.library, self.device = _compiled(device), device
         size = self.size = (camera.height, camera.width)
         where = jax.jit(seen, static_argnums=1)(scene, settings)
-        pixels = pixels_of(all_blocks(*size), *size)
+        pixels = pixels_of(dealt_blocks(*size), *size)
         aimed, _ = jax.jit(aim, static_argnums=2)(scene, camera, settings, pixels, where)
         assert isinstance(scene.transfer, jvr.LutTransfer)
         assert where.occupancy is not None

@@ -101,20 +101,25 @@ def skipping() -> dict[str, Any]:
     return found
 
 
-def parts() -> dict[str, Any]:
-    """Image and gradient in a transfer function: in parts, as a function that is not compiled as a whole has it, over one program."""
+def devices() -> dict[str, Any]:
+    """Image and gradient in a transfer function, over all cores and over one, within the caller's own `jax.jit`, each of one program."""
     volume, settings, found = scenes.gyroid(), jvr.Settings(0.5), {}
-    difference = jax.jit(lambda rgb: jnp.mean(jnp.square(rgb - 0.5)))
     for kind, transfer in {"opaque": scenes.opaque(), "translucent": scenes.translucent()}.items():
         for size in (128, 400):
             scene, camera = jvr.Scene(volume, transfer), scenes.camera(volume, size)
-            loss = lambda t, scene=scene, camera=camera: difference(
-                jvr.render(eqx.tree_at(lambda s: s.transfer, scene, t), camera, settings).rgb
+            loss = lambda t, scene=scene, camera=camera: jnp.mean(
+                jnp.square(jvr.render(eqx.tree_at(lambda s: s.transfer, scene, t), camera, settings).rgb - 0.5)
             )
-            in_parts = jax.value_and_grad(loss)
-            whole = jax.jit(in_parts)
-            times = seconds({"parts": lambda f=in_parts, t=transfer: f(t), "whole": lambda f=whole, t=transfer: f(t)})
-            found[f"{kind}_{size}_parts_over_whole"] = ratio(times, "parts", "whole")
+            functions: dict[str, Any] = {}
+            for name, of in (("image", loss), ("gradient", jax.value_and_grad(loss))):
+                everywhere = jax.jit(of)
+                functions[f"{name}_all"] = lambda f=everywhere, t=transfer: f(t)
+                with jax.default_device(jax.devices()[0]):
+                    lowered = jax.jit(of).lower(transfer).compile()
+                functions[f"{name}_one"] = lambda f=lowered, t=transfer: f(t)
+            times = seconds(functions)
+            for name in ("image", "gradient"):
+                found[f"{kind}_{size}_{name}_all_over_one"] = ratio(times, f"{name}_all", f"{name}_one")
     return found
 
 
@@ -149,7 +154,7 @@ def fitting() -> dict[str, Any]:
         return {"skipped": "needs the CT head of the public volumes: set JVR_DATA to their folder"}
     start, cameras, images, settings = protocol.start, protocol.cameras, protocol.images, protocol.settings
     chunk = sum(camera.width * camera.height for camera in cameras)
-    observations = observe(start, cameras, images, None, settings, chunk)
+    observations = observe(start, cameras, images, None, settings).dealt(chunk)
     kept = keep_samples(start, observations, settings, chunk, 2**31, clamped=True)
     assert kept is not None
     through, rays = observed_medium(start, kept[1], kept[0], settings, seen_in_fit(start, settings, False))
@@ -208,7 +213,7 @@ CASES = {
     "forward": forward,
     "gradient": gradient,
     "skipping": skipping,
-    "parts": parts,
+    "devices": devices,
     "memory": memory,
     "light": light,
     "fitting": fitting,

@@ -161,4 +161,5 @@ def machine() -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    jvr.use_all_cores()
     main()

@@ -23,7 +23,6 @@ import jvr
 from experiments.accuracy_vs_time import machine
 from experiments.protocols import DATA, HEAD
 from jvr.io.config import build_cameras, build_scene, build_settings, read_config
-from jvr.parallel import in_threads
 from jvr.pictures import srgb_from_linear
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -224,7 +223,7 @@ def pictures(subjects: list[Subject]) -> Pictures:
             print(f"{of.name:<18}{title:<28}mean {rgb.mean():.3f}   largest {rgb.max():.2f}", flush=True)
         return found
 
-    found = in_threads(one_title, titles)
+    found = [one_title(title) for title in titles]
     names = [title for title, _ in titles]
     return {of.name: dict(zip(names, [some[i] for some in found], strict=True)) for i, of in enumerate(subjects)}
 
@@ -279,4 +278,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    jvr.use_all_cores()
     main()

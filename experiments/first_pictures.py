@@ -129,4 +129,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
+    jvr.use_all_cores()
     main()

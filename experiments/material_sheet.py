@@ -115,4 +115,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    jvr.use_all_cores()
     main()

@@ -136,4 +136,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    jvr.use_all_cores()
     main()

@@ -131,4 +131,5 @@ def figure(results: list[dict[str, Any]], path: str) -> None:
 
 
 if __name__ == "__main__":
+    jvr.use_all_cores()
     main()

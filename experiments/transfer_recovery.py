@@ -120,4 +120,5 @@ def figure(results: dict[str, jvr.FitResult], path: str) -> None:
 
 
 if __name__ == "__main__":
+    jvr.use_all_cores()
     main()

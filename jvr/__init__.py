@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from jvr.effects.shadow_rays import ShadowRays as ShadowRays
     from jvr.effects.shadow_volume import OpacityShadowMap as OpacityShadowMap
     from jvr.effects.shadow_volume import ShadowVolume as ShadowVolume
+    from jvr.execution.devices import use_all_cores as use_all_cores
     from jvr.fitting.fit import FitResult as FitResult
     from jvr.fitting.fit import fit as fit
     from jvr.fitting.initialise import colours_given_extinction as colours_given_extinction
@@ -134,6 +135,7 @@ _NAMES = {
     "jvr.effects.shadow_map": ("ShadowMap",),
     "jvr.effects.shadow_rays": ("ShadowRays",),
     "jvr.effects.shadow_volume": ("OpacityShadowMap", "ShadowVolume"),
+    "jvr.execution.devices": ("use_all_cores",),
     "jvr.fitting.fit": ("FitResult", "fit"),
     "jvr.fitting.initialise": ("colours_given_extinction", "flat_transfer"),
     "jvr.fitting.least_squares": ("Dogleg", "GaussNewton", "LevenbergMarquardt"),

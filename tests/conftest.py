@@ -13,6 +13,9 @@ _hook.__enter__()
 import jax
 import pytest
 
+if "JVR_TEST_DEVICES" in os.environ:
+    jax.config.update("jax_num_cpu_devices", int(os.environ["JVR_TEST_DEVICES"]))
+
 DATA = Path(os.environ.get("JVR_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 

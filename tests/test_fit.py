@@ -97,7 +97,7 @@ def test_kept_samples_change_nothing_and_report_their_bytes():
 
 
 def test_kept_samples_are_the_samples():
-    problem, observations = _problem(), observe(START, CAMERAS, IMAGES, None, SETTINGS, 720)
+    problem, observations = _problem(), observe(START, CAMERAS, IMAGES, None, SETTINGS).dealt(720)
     samples, kept = keep_samples(START, observations, SETTINGS, 720, 2**30, clamped=True)
     values = problem.unknowns.values_from_real(problem.unknowns.real_from_model(problem.model), problem.model)
     direct = normal_equations(problem, values, observations)
@@ -129,7 +129,7 @@ def test_normal_equations_have_the_gradient_of_the_objective(loss, names, x64):
     unknowns = choose_unknowns(model, lambda m: (pick(m.scene), m.exposure))
     unknowns = eqx.tree_at(lambda u: u.transforms, unknowns, (jvr.Identity(),) * len(unknowns.transforms))
     problem = Problem(model, unknowns, SETTINGS, loss, (), None)
-    observations = observe(scene, CAMERAS, [0.8 * image for image in IMAGES], None, SETTINGS, 720)
+    observations = observe(scene, CAMERAS, [0.8 * image for image in IMAGES], None, SETTINGS).dealt(720)
     values = unknowns.real_from_model(model)
     normal = normal_equations(problem, values, observations)
     pieces = jax.tree.map(lambda x: x[None], observations)

@@ -164,10 +164,10 @@ def both_ways(one, unknowns):
     """The gradient of a fit's objective, by the normal equations and by reverse mode."""
     problem, values = problem_of(one, unknowns)
     cameras, images = views(scene(one.volume, sigma=0.3))
-    observations = observe(one, cameras, images, None, SETTINGS, 128)
+    observations = observe(one, cameras, images, None, SETTINGS).dealt(128)
     total = jnp.asarray(3.0 * observations.size)
     around = prepared(problem, values)
-    vectors = [normal_equations(problem, values, piece, around).vector for piece in observations.chunks(128)]
+    vectors = [normal_equations(problem, values, piece, around).vector for piece in observations.pieces(128)]
     # On the real line every value is itself.
     identity = eqx.tree_at(lambda p: p.unknowns.transforms, problem, tuple(jvr.Identity() for _ in problem.unknowns.transforms))
     pieces = jax.tree.map(lambda x: x.reshape(-1, 128, *x.shape[1:]), observations)

@@ -17,7 +17,7 @@ PACKAGE = Path(jvr.__file__).parent
 ORDER = (
     "types",
     "numerics",
-    "parallel",
+    "execution",
     "atomic",
     "pictures",
     "model",

@@ -33,8 +33,7 @@ class Renderer:
         settings = jvr.Settings(step, termination=TERMINATION)
         self._image = lambda scene, camera: jvr.render(scene, camera, settings).rgb
         loss = lambda entries, scene, camera: _loss(entries, scene, camera, settings)
-        # Not compiled as a whole, so that the picture and the walk back use all cores.
-        self._gradient = jax.value_and_grad(loss, has_aux=True)
+        self._gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))
 
     def draw(self) -> None:
         self.drawn = np.asarray(self._image(self.scene, self.camera))

@@ -5,7 +5,7 @@ from typing import Any
 
 from jvr.cli.beforehand import Beforehand
 from jvr.cli.inputs import BadInput, reading
-from jvr.cli.runtime import progress, provenance, use_compilation_cache
+from jvr.cli.runtime import progress, provenance, start_jax
 from jvr.io.config import Config, build_cameras, build_scene, build_settings
 from jvr.rendering.advise import Advice, advise
 
@@ -14,7 +14,7 @@ def advise_on(config: Config, tolerance: float | None) -> tuple[Advice, dict[str
     """Measures what each effect of a configuration's scene contributes to the picture of its first camera."""
     import equinox as eqx
 
-    use_compilation_cache()
+    start_jax()
     began = time.perf_counter()
     beforehand = Beforehand()
     with reading():

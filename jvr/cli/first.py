@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jvr.cli.inputs import BadInput, load
+from jvr.cli.runtime import start_jax
 from jvr.io.config import Config, build_volume, config_from, interpolated
 from jvr.model.volume import Volume
 
@@ -33,6 +34,7 @@ def configured(given: Path, sets: list[str], keywords: dict[str, Any], wishes: W
         return load(given, sets, keywords), None, []
     from jvr.io.first_picture import first_picture
 
+    start_jax()
     volume = build_volume(load(given, [text for text in sets if text.startswith("volume.")], keywords))
     tables, notes = first_picture(volume, given, wishes.preset, lit=wishes.lit is not False)
     tables["volume"] = {"path": str(given.absolute()), **keywords, **tables.get("volume", {})}

@@ -14,7 +14,7 @@ import numpy as np
 from jvr.cli.beforehand import Beforehand
 from jvr.cli.folder import CHECKPOINT, PAGE, RESULT, TRANSFER, alone_in, check_results, results_in
 from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by_jvr
-from jvr.cli.runtime import nested, plain, progress, provenance, use_compilation_cache
+from jvr.cli.runtime import nested, plain, progress, provenance, start_jax
 from jvr.cli.signals import INTERRUPTED, Terminated, said
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
 
@@ -32,7 +32,7 @@ def fit_scene(config: Config, folder: Path, *, resume: bool = False, force: bool
     **Raises** `BadInput` where the folder holds what would be written over, and another fit writes there: `resume` goes on from its
     checkpoint, `force` replaces results of another run.
     """
-    use_compilation_cache()
+    start_jax()
     began = time.perf_counter()
     beforehand = Beforehand()
     checkpoint = folder / CHECKPOINT

@@ -8,7 +8,7 @@ import numpy as np
 
 from jvr.cli.beforehand import Beforehand
 from jvr.cli.inputs import BadInput, check_inputs_stay, explain, inputs_of, reading, refused_by_jvr
-from jvr.cli.runtime import plain, progress, provenance, use_compilation_cache
+from jvr.cli.runtime import plain, progress, provenance, start_jax
 from jvr.io.animation import write_animation
 from jvr.io.config import Config, build_cameras, build_scene, build_settings
 from jvr.io.config.schema.transfer import PresetTable
@@ -22,7 +22,7 @@ TURN = 6.0
 def render_pictures(config: Config, output: Path, volume: Volume | None = None, *, animated: bool = False) -> dict[str, Any]:
     """Renders every camera of a configuration: to `output`, or with several cameras to numbered files beside it, and where these are to be
     `animated`, to a moving picture beside them. `volume`: that of the configuration, where it is read already."""
-    use_compilation_cache()
+    start_jax()
     began = time.perf_counter()
     beforehand = Beforehand()
     with reading():

@@ -11,8 +11,12 @@ from pathlib import Path
 from typing import Any
 
 
-def use_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder, so that the second run starts at once; `JVR_CACHE=0` turns it off."""
+def start_jax() -> None:
+    """Spreads rays over all cores, and keeps compiled programs in the user's cache folder, so that the second run starts at once;
+    `JVR_CACHE=0` turns that off."""
+    from jvr.execution.devices import use_all_cores
+
+    use_all_cores()
     folder = None if "JAX_COMPILATION_CACHE_DIR" in os.environ else cache_folder("xla")
     if folder is None:
         return

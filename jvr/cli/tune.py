@@ -9,7 +9,7 @@ from typing import Any
 from jvr.atomic import replacing
 from jvr.cli.beforehand import Beforehand
 from jvr.cli.inputs import BadInput, reading
-from jvr.cli.runtime import progress, provenance, use_compilation_cache
+from jvr.cli.runtime import progress, provenance, start_jax
 from jvr.io.config import Config, build_cameras, build_scene
 from jvr.march.quadrature import PreIntegrated
 from jvr.rendering.measure import Measurement
@@ -24,7 +24,7 @@ def tune_settings(config: Config, output: Path, error: float | None, seconds: fl
 
     **Raises** `BadInput` where nothing meets the target, with what can be met; nothing is written then.
     """
-    use_compilation_cache()
+    start_jax()
     began = time.perf_counter()
     beforehand = Beforehand()
     with reading():

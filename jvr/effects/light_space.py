@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jvr.execution.devices import over_rays, shares
 from jvr.march.medium import Medium
 from jvr.march.segments import classify_at
 from jvr.march.steps import Point
@@ -164,7 +165,27 @@ def depth_nodes(
     """Optical depth from the light to `layers + 1` equally distant depths of `texels^2` rays, by the midpoint rule with `samples` samples a
     layer, swept away from the light."""
     axis = jnp.linspace(-1.0, 1.0, texels)
-    u, v = (c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij"))
+    places = tuple(c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij"))
+    fill = -(texels**2) % shares()
+    places = tuple(jnp.pad(c, (0, fill), mode="edge") for c in places)
+
+    def share(shared: tuple[AbstractLightSpace, Scene, Medium], places: tuple[Array, Array]) -> Array:
+        return _swept(*shared, places, layers, samples)
+
+    swept = over_rays(share, (space, scene, medium), places)
+    return jnp.moveaxis(swept[: texels**2], 1, 0).reshape(layers + 1, texels, texels, -1)
+
+
+def _swept(
+    space: AbstractLightSpace,
+    scene: Scene,
+    medium: Medium,
+    places: tuple[Float[Array, "rays"], Float[Array, "rays"]],
+    layers: int,
+    samples: int,
+) -> Float[Array, "rays nodes channels"]:
+    """`depth_nodes` of the rays in some places `(u, v)`."""
+    u, v = places
     rays = rays_through(space, scene, u, v)
     together = min(max(1, SWEPT // (u.size * samples)), layers)
     blocks = -(-layers // together)
@@ -173,7 +194,7 @@ def depth_nodes(
     # Checkpointed: the way back computes a block of layers again rather than keep all of its voxels.
     @jax.checkpoint
     def sweep(tau: Channels, block: Array) -> tuple[Channels, Channels]:
-        steps = block * together * samples + jnp.arange(together * samples, dtype=axis.dtype)
+        steps = block * together * samples + jnp.arange(together * samples, dtype=u.dtype)
         begin, end = (jnp.repeat(steps + half, u.size) / (samples * layers) for half in (0, 1))
         dtau = depth_between(medium, scene.volume, of_all, begin, end)
         depths = tuple(
@@ -183,9 +204,9 @@ def depth_nodes(
 
     channels = jax.eval_shape(lambda: depth_between(medium, scene.volume, rays, u, v))
     zero = tuple(jnp.zeros(u.shape, c.dtype) for c in channels)
-    _, depths = jax.lax.scan(sweep, zero, jnp.arange(blocks, dtype=axis.dtype))
+    _, depths = jax.lax.scan(sweep, zero, jnp.arange(blocks, dtype=u.dtype))
     swept = [jnp.concatenate([z[None], d.reshape(-1, u.size)[:layers]]) for z, d in zip(zero, depths, strict=True)]
-    return jnp.stack(swept, axis=-1).reshape(layers + 1, texels, texels, -1)
+    return jnp.moveaxis(jnp.stack(swept, axis=-1), 0, 1)
 
 
 def bilinear(texels: int, u: Scalar, v: Scalar) -> list[tuple[Array, Scalar]]:

@@ -20,6 +20,8 @@ from jvr.effects.radiance_transfer import (
     node_positions,
     project_nodes,
 )
+from jvr.execution.devices import over_rays, shares
+from jvr.execution.tiles import dealt, joined
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.harmonics.algebra import product_matrix
@@ -147,15 +149,18 @@ def project_all(projection: TransferProjection) -> tuple[Float[Array, "nodes cha
     chunks = jnp.asarray(np.pad(p, ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3))
     busy = jnp.pad(active, (0, fill)).reshape(-1, CHUNK)
     # Not the bound method: JAX hashes what it is to call, and Equinox all that a method is bound to.
-    one = lambda p: projection.project(p)
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(one, chunks[0]))
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda p: projection.project(p), chunks[0]))
 
-    def chunk(inputs: tuple[Array, Array]) -> Any:
-        p, busy = inputs
-        found = jax.lax.cond(jnp.any(busy), one, lambda p: blank, p)
-        return jax.tree.map(lambda x: jnp.where(busy.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0), found)
+    def share(projection: TransferProjection, inputs: tuple[Array, Array]) -> Any:
+        def chunk(inputs: tuple[Array, Array]) -> Any:
+            p, busy = inputs
+            found = jax.lax.cond(jnp.any(busy), lambda p: projection.project(p), lambda p: blank, p)
+            return jax.tree.map(lambda x: jnp.where(busy.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0), found)
 
-    found = jax.lax.map(chunk, (chunks, busy))
+        return jax.lax.map(chunk, inputs)
+
+    order = dealt(len(chunks), shares())
+    found = joined(over_rays(share, projection, (chunks[order], busy[order])), len(chunks), shares())
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(p)], found)
 
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from jvr.execution.devices import shares
 from jvr.fitting import checkpoint as checkpoints
 from jvr.fitting.identifiability import Determination, undetermined
 from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
@@ -172,10 +173,10 @@ def fit(
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
     _check(problem, solver)
 
-    chunk = min(CHUNK, sum(camera.width * camera.height for camera in cameras))
-    observations = observe(scene, cameras, targets, weights, settings, chunk)
-    problem, observations = _keep(problem, observations, chunk, keep_samples)
-    work = Work(problem, observations, chunk, cameras, targets)
+    observations = observe(scene, cameras, targets, weights, settings)
+    chunk = min(CHUNK, -(-observations.size // shares()))
+    problem, dealt = _keep(problem, observations.dealt(chunk), chunk, keep_samples)
+    work = Work(problem, dealt, chunk, cameras, targets)
     mark = checkpoints.fingerprint(problem, observations, solver) if checkpoint else {}
     state, history = solver.init(work.functions, chosen.real_from_model(model)), []
     if checkpoint and resume and Path(checkpoint).exists():

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jvr.execution.devices import shares
 from jvr.fitting.losses import SquaredError
 from jvr.fitting.objective import Problem, normal_equations
 from jvr.fitting.observations import check_images, observe
@@ -49,10 +50,11 @@ def colours_given_extinction(
     colours: Any = lambda scene: scene.transfer.rgb
     unknowns = choose_unknowns(Exposed(scene, None), lambda m: colours(m.scene))
     problem = Problem(Exposed(scene, None), unknowns, settings, SquaredError(), (), None)
-    chunk = min(16_384, sum(camera.width * camera.height for camera in cameras))
+    observations = observe(scene, cameras, targets, None, settings)
+    chunk = min(16_384, -(-observations.size // shares()))
     start = jnp.ravel(scene.transfer.rgb)
     matrix, vector = np.zeros((start.size,) * 2), np.zeros(start.size)
-    for piece in observe(scene, cameras, targets, None, settings, chunk).chunks(chunk):
+    for piece in observations.dealt(chunk).pieces(chunk):
         normal = normal_equations(problem, start, piece)
         matrix += np.asarray(normal.matrix, np.float64)
         vector += np.asarray(normal.vector, np.float64)

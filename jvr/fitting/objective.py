@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jvr.execution.devices import everywhere, over_rays, shares
+from jvr.execution.tiles import dealt_blocks, picture_of, pixels_of
 from jvr.fitting.losses import AbstractPrior, SquaredError
 from jvr.fitting.observations import Observations, Samples, observed_medium, seen_in_fit
 from jvr.fitting.unknowns import Exposed, Unknowns
@@ -24,10 +26,9 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
 from jvr.rendering.medium import needs_gradient
-from jvr.rendering.parts import all_blocks, picture_of, pixels_of
 from jvr.rendering.settings import Settings
 from jvr.rendering.trace import Seen, composite, step_length, trace
-from jvr.types import Scalar, Triple
+from jvr.types import Image, Scalar, Triple
 
 
 class Problem(eqx.Module):
@@ -44,19 +45,32 @@ class Problem(eqx.Module):
     def with_samples(self, samples: Samples) -> "Problem":
         return Problem(self.model, self.unknowns, self.settings, self.loss, self.priors, samples, self.leaps)
 
+    def apart(self) -> "tuple[Problem, Array | None]":
+        """What all devices share of it, and the kept samples, of which each has those of its own rays."""
+        if self.samples is None:
+            return self, None
+        stored = lambda problem: problem.samples.stored
+        return eqx.tree_at(stored, self, None), self.samples.stored
+
+    def whole(self, stored: Array | None) -> "Problem":
+        """What `apart` undoes on one device."""
+        if stored is None:
+            return self
+        return eqx.tree_at(lambda problem: problem.samples.stored, self, stored, is_leaf=lambda x: x is None)
+
     def least_squares(self) -> "Problem":
         """The same unknowns and data, the squared error alone."""
         return Problem(self.model, self.unknowns, self.settings, SquaredError(), (), self.samples, self.leaps)
 
 
-class _Channel(NamedTuple):
-    """One colour channel of a chunk: for each ray `r`, `w` and `w rho(r)` of `Normal`, and its row for the unknowns in `columns`."""
+class _Channel(eqx.Module):
+    """One colour channel of a piece: for each ray `r`, `w` and `w rho(r)` of `Normal`, and its row for the unknowns in `columns`."""
 
     residual: Float[Array, "rays"]
     weight: Float[Array, "rays"]
     loss: Float[Array, "rays"]
     rows: Float[Array, "rays columns"]
-    columns: Int[Array, "columns"]
+    columns: tuple[int, ...] = eqx.field(static=True)
 
 
 class Normal(NamedTuple):
@@ -85,13 +99,40 @@ def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations
     """Mean loss over all pixels plus priors, as a function of the unknowns on the real line. `pieces` has a leading axis of chunks."""
     model = problem.unknowns.model_from_real(problem.model, real)
     seen = seen_in_fit(model.scene, problem.settings, problem.leaps)
+    shared, stored = problem.apart()
 
-    def add_piece(sum_: Scalar, piece: Observations) -> tuple[Scalar, None]:
-        r = residual(problem, model, piece, seen)
-        return sum_ + sum(jnp.sum(piece.weight * problem.loss.value(c)) for c in r), None
+    def share(shared: tuple[Problem, Exposed, Seen], rays: tuple[Array | None, Observations]) -> Array:
+        problem, model, seen = shared
+        stored, pieces = rays
 
-    loss, _ = jax.lax.scan(add_piece, jnp.zeros((), real.dtype), pieces)
+        def add_piece(sum_: Scalar, piece: Observations) -> tuple[Scalar, None]:
+            r = residual(problem.whole(stored), model, piece, seen)
+            return sum_ + sum(jnp.sum(piece.weight * problem.loss.value(c)) for c in r), None
+
+        return jax.lax.scan(add_piece, jnp.zeros((), real.dtype), pieces)[0][None]
+
+    loss = jnp.sum(over_rays(share, (shared, model, seen), (stored, pieces)))
     return loss / total + prior(problem, model)
+
+
+@eqx.filter_jit
+def residuals(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Array:
+    """The whole residual vector, scaled to a squared length of the mean squared error; priors have no residuals."""
+    model = problem.unknowns.model_from_real(problem.model, real)
+    adjoint, seen = adjoint_of(problem), seen_in_fit(model.scene, problem.settings, problem.leaps)
+    shared, stored = problem.apart()
+
+    def share(shared: tuple[Problem, Exposed, Seen, Scalar], rays: tuple[Array | None, Observations]) -> Array:
+        problem, model, seen, total = shared
+        stored, pieces = rays
+
+        def of_piece(piece: Observations) -> Array:
+            scale = jnp.sqrt(piece.weight / total)
+            return jnp.stack([scale * c for c in residual(problem.whole(stored), model, piece, seen, adjoint)])
+
+        return jax.lax.map(of_piece, pieces)
+
+    return jnp.ravel(everywhere(over_rays(share, (shared, model, seen, total), (stored, pieces))))
 
 
 def residual(problem: Problem, model: Exposed, piece: Observations, seen: Seen, adjoint: AbstractAdjoint = Replay()) -> Triple:
@@ -112,11 +153,23 @@ def image_value(
     settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
     losses, where = [], seen_in_fit(model.scene, settings, problem.leaps)
     for camera, target in zip(cameras, images, strict=True):
-        size = (camera.height, camera.width)
-        gathered, rays, _ = trace(model.scene, camera, settings, pixels_of(all_blocks(*size), *size), where=where)
-        rendered = jnp.stack(predict(problem, model, gathered, rays.length), axis=-1)
-        losses.append(problem.loss.image(picture_of(rendered, *size), target))
+        rendered = _rendered(problem, model, camera, settings, where)
+        losses.append(problem.loss.image(rendered, target))
     return jnp.mean(jnp.stack(losses)) + prior(problem, model)
+
+
+def _rendered(problem: Problem, model: Exposed, camera: AbstractCamera, settings: Settings, seen: Seen) -> Image:
+    """A whole image, colours as the targets have them."""
+    height, width = camera.height, camera.width
+
+    def share(shared: tuple[Problem, Exposed, AbstractCamera, Seen], blocks: Int[Array, "blocks"]) -> Float[Array, "rays 3"]:
+        problem, model, camera, seen = shared
+        gathered, rays, _ = trace(model.scene, camera, settings, pixels_of(blocks, height, width), where=seen)
+        return jnp.stack(predict(problem, model, gathered, rays.length), axis=-1)
+
+    shared = (problem.apart()[0], model, camera, seen)
+    rays = everywhere(over_rays(share, shared, dealt_blocks(height, width, shares())))
+    return picture_of(rays, height, width, shares())
 
 
 def prior(problem: Problem, model: Exposed) -> Scalar | float:
@@ -169,7 +222,7 @@ def _prepared(problem: Problem, values: Float[Array, "unknowns"]) -> Prepared:
 def normal_equations(
     problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: Prepared | None = None
 ) -> Normal:
-    """The sums of `Normal` over one chunk of rays, in float64; `around`: what `prepared` returns, else made for this chunk alone.
+    """The sums of `Normal` over one piece of rays, in float64; `around`: what `prepared` returns, else made for this piece alone.
 
     The rows have the precision of `values`, their products are summed in float64. A matrix summed in float32 is uncertain by 1e-7, and
     already an eigenvalue of 1e-7 is a combination of unknowns that changes the images by 3e-4 of what a single one does.
@@ -181,12 +234,23 @@ def normal_equations(
 
 @eqx.filter_jit
 def _channels(problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: Prepared | None) -> list[_Channel]:
+    shared, stored = problem.apart()
+
+    def share(shared: tuple[Problem, Array, Prepared | None], rays: tuple[Array | None, Observations]) -> list[_Channel]:
+        return _share_of_channels(shared[0].whole(rays[0]), shared[1], rays[1], shared[2])
+
+    return over_rays(share, (shared, values, around), (stored, piece))
+
+
+def _share_of_channels(
+    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: Prepared | None
+) -> list[_Channel]:
     colours, blocks = _jacobian(problem, values, piece, around)
     channels = []
     for c, colour in enumerate(colours):
         r = colour - piece.target[:, c]
         rows = jnp.concatenate([block for block, _ in blocks[c]], axis=1)
-        columns = jnp.asarray(np.concatenate([columns for _, columns in blocks[c]]), jnp.int32)
+        columns = tuple(np.concatenate([columns for _, columns in blocks[c]]).tolist())
         losses = piece.weight * problem.loss.value(r)
         channels.append(_Channel(r, piece.weight * problem.loss.weight(r), losses, rows, columns))
     return channels
@@ -196,8 +260,8 @@ def _channels(problem: Problem, values: Float[Array, "unknowns"], piece: Observa
 def _sums(channels: list[_Channel], n: int) -> Normal:
     total = Normal(jnp.zeros(()), jnp.zeros(()), jnp.zeros((n, n)), jnp.zeros(n))
     for channel in channels:
-        r, weight, losses, rows = (x.astype(float) for x in channel[:4])
-        weighted, columns = rows * weight[:, None], channel.columns
+        r, weight, losses, rows = (x.astype(float) for x in jax.tree.leaves(channel))
+        weighted, columns = rows * weight[:, None], np.asarray(channel.columns, np.int32)
         total = Normal(
             total.loss + jnp.sum(losses),
             total.squares + jnp.sum(weight * jnp.square(r)),

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jvr.execution.devices import everywhere, on_devices, over_rays, shares
 from jvr.march.fields import MISSING, KeptField, VoxelField
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
@@ -27,11 +28,13 @@ from jvr.types import Triple
 
 
 class Observations(eqx.Module):
-    """World rays with the colour that each should have. Rays that cross more of the volume come first.
+    """World rays with the colour that each should have, in shares of as many rays for each device; in each, rays that cross more of the
+    volume come first.
 
     A ray starts at `origin + low`, the eye is `behind` that by so much (see `AbstractCamera.rays_ahead`).
 
-    `weight` is 0 for the rays that fill up the last chunk. `start` is where a ray's kept samples begin, all 0 without any.
+    `weight` is 0 for the rays that fill up the last chunk of a share. `start` is where a ray's kept samples begin in what its device
+    holds, all 0 without any.
     """
 
     origin: Triple
@@ -46,18 +49,34 @@ class Observations(eqx.Module):
     def size(self) -> int:
         return self.weight.shape[0]
 
-    def chunks(self, size: int) -> list["Observations"]:
-        """Pieces of `size` rays."""
-        return [self.piece(i, size) for i in range(0, self.size, size)]
+    def dealt(self, chunk: int) -> "Observations":
+        """Dealt out in turn to `shares()`, each filled up to whole chunks."""
+        order = np.arange(self.size)
+        order = np.pad(order, (0, -len(order) % (chunk * shares())), mode="edge")
+        filled = jax.tree.map(lambda x: x[order], self)
+        filled = eqx.tree_at(lambda o: o.weight, filled, filled.weight.at[self.size :].set(0))
+        return jax.tree.map(lambda x: x[order.reshape(-1, shares()).T.ravel()], filled)
 
-    def piece(self, begin: int, size: int) -> "Observations":
-        """`size` rays from `begin` on."""
-        return jax.tree.map(lambda x: x[begin : begin + size], self)
+    def thinned(self, every: int, chunk: int) -> "Observations":
+        """Every `every`-th ray of each share, filled up to whole chunks."""
+        each = self.size // shares()
+        index = np.arange(0, each, every)
+        kept = len(index)
+        index = np.pad(index, (0, -kept % chunk))
+        thin = jax.tree.map(lambda x: x.reshape(shares(), each, *x.shape[1:])[:, index], self)
+        thin = eqx.tree_at(lambda o: o.weight, thin, thin.weight.at[:, kept:].set(0))
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), thin)
+
+    def pieces(self, chunk: int) -> list["Observations"]:
+        """One chunk of every share at a time."""
+        split = jax.tree.map(lambda x: x.reshape(shares(), -1, chunk, *x.shape[1:]), self)
+        of_all = lambda i: jax.tree.map(lambda x: on_devices(x[:, i].reshape(-1, *x.shape[3:])), split)
+        return [of_all(i) for i in range(self.size // (chunk * shares()))]
 
 
 class Samples(eqx.Module):
-    """Scalars along every ray, 16 bits each, in blocks of `stride` rays: sample `k` of a ray is at `start + k * stride`. `gaps`: whether
-    some are missing."""
+    """Scalars along every ray, 16 bits each, in blocks of `stride` rays: sample `k` of a ray is at `start + k * stride` in what is `stored`
+    for its share. `gaps`: whether some are missing."""
 
     stored: Any
     low: Float[Array, ""]
@@ -108,9 +127,8 @@ def observe(
     images: Sequence[np.ndarray],
     weights: Sequence[Any] | None,
     settings: Settings,
-    chunk: int,
 ) -> Observations:
-    """All pixels of all images as observations, sorted by the length of their rays and filled up to whole chunks.
+    """All pixels of all images as observations, sorted by the length of their rays.
 
     **Raises** `ValueError` for settings that fits do not support.
     """
@@ -128,10 +146,7 @@ def observe(
     placed = (shared(origin), shared(low), shared(behind), shared(direction))
     whole = Observations(*placed, jnp.asarray(target), jnp.asarray(weight), start)
     order = np.argsort(-np.asarray(_inside(scene, whole).length), kind="stable")
-    fill = -len(order) % chunk
-    order = np.concatenate([order, np.full(fill, order[-1])])
-    whole = jax.tree.map(lambda x: x[order], whole)
-    return eqx.tree_at(lambda o: o.weight, whole, whole.weight.at[len(order) - fill :].set(0))
+    return jax.tree.map(lambda x: x[order], whole)
 
 
 @jax.jit
@@ -157,14 +172,6 @@ def _inside(scene: Scene, piece: Observations) -> Rays:
     return enter(scene, origin, piece.direction, piece.behind)[0]
 
 
-def thin(observations: Observations, every: int, chunk: int) -> Observations:
-    """Every `every`-th observation, filled up to whole chunks."""
-    index = np.arange(0, observations.size, every)
-    fill = -len(index) % chunk
-    thinned = jax.tree.map(lambda x: x[np.concatenate([index, np.zeros(fill, int)])], observations)
-    return eqx.tree_at(lambda o: o.weight, thinned, thinned.weight.at[len(index) :].set(0))
-
-
 def keep_samples(
     scene: Scene, observations: Observations, settings: Settings, chunk: int, limit: int, *, clamped: bool
 ) -> tuple[Samples, Observations] | None:
@@ -173,22 +180,24 @@ def keep_samples(
     The error of a kept sample is at most 2^-17 of the range of the volume's values, of those between the ends of a table where these stay
     (`clamped`).
     """
-    pieces = observations.chunks(chunk)
+    pieces = observations.pieces(chunk)
     counts = [int(_longest(scene, piece, settings)) for piece in pieces]
     total = chunk * sum(counts)
-    if 2 * total > limit or total >= 2**31:
+    if 2 * total * shares() > limit or total >= 2**31:
         return None
     low, high = _kept_range(scene, clamped)
     scale = jnp.where(high > low, (high - low) / (MISSING - 1), 1.0)
-    stored = np.empty(total, np.uint16)
+    stored = np.empty((shares(), total), np.uint16)
     starts, begin = [], 0
     for piece, count in zip(pieces, counts, strict=True):
         for k in range(count):
-            stored[begin + k * chunk : begin + (k + 1) * chunk] = _resample(scene, piece, settings, jnp.int32(k), low, scale)
+            found = _resample(scene, piece, settings, jnp.int32(k), low, scale)
+            stored[:, begin + k * chunk : begin + (k + 1) * chunk] = found.reshape(shares(), chunk)
         starts.append(begin + np.arange(chunk, dtype=np.int32))
         begin += chunk * count
-    kept = eqx.tree_at(lambda o: o.start, observations, jnp.asarray(np.concatenate(starts)))
-    return Samples(jnp.asarray(stored), low, scale, chunk, scene.volume.gaps is not None), kept
+    start = np.tile(np.concatenate(starts), shares())
+    kept = eqx.tree_at(lambda o: o.start, observations, jnp.asarray(start))
+    return Samples(on_devices(stored.ravel()), low, scale, chunk, scene.volume.gaps is not None), kept
 
 
 def _kept_range(scene: Scene, clamped: bool) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -235,14 +244,17 @@ def _longest(scene: Scene, piece: Observations, settings: Settings) -> Int[Array
 
 @eqx.filter_jit
 def _resample(scene: Scene, piece: Observations, settings: Settings, k: Int[Array, ""], low: Array, scale: Array) -> Array:
-    rays = _inside(scene, piece)
-    dt = step_length(scene, settings)
-    _, u = segment(k, segment_count(rays.length, dt), rays.length, dt)
-    found = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
-    level = jnp.clip(jnp.round((found.s - low) / scale), 0, MISSING - 1)
-    for known in found.known:
-        level = jnp.where(known > 0.5, level, MISSING)
-    return level.astype(jnp.uint16)
+    def share(shared: tuple[Scene, Array, Array, Array], piece: Observations) -> Array:
+        scene, k, low, scale = shared
+        rays, dt = _inside(scene, piece), step_length(scene, settings)
+        _, u = segment(k, segment_count(rays.length, dt), rays.length, dt)
+        found = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
+        level = jnp.clip(jnp.round((found.s - low) / scale), 0, MISSING - 1)
+        for known in found.known:
+            level = jnp.where(known > 0.5, level, MISSING)
+        return level.astype(jnp.uint16)
+
+    return everywhere(over_rays(share, (scene, k, low, scale), piece))
 
 
 def _check_weights(cameras: Sequence[AbstractCamera], weights: Sequence[Any] | None, dtype: Any) -> list[np.ndarray]:

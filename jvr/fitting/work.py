@@ -10,23 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jvr.execution.devices import on_devices
 from jvr.fitting.identifiability import Determination, determination
 from jvr.fitting.losses import DSSIM, SquaredError
 from jvr.fitting.objective import (
     Normal,
     Problem,
-    adjoint_of,
     image_value,
     normal_equations,
     prepared,
     prior_expansion,
-    residual,
+    residuals,
     value,
 )
-from jvr.fitting.observations import Observations, seen_in_fit, thin
+from jvr.fitting.observations import Observations
 from jvr.fitting.solvers import Functions, Limits
 from jvr.model.camera import AbstractCamera
-from jvr.parallel import in_threads
 from jvr.types import Scalar
 
 # The first level of a least-squares solver takes at most every so-manieth ray ...
@@ -60,21 +59,14 @@ class ImageValueFunction(eqx.Module):
 
 
 class ResidualFunction(eqx.Module):
-    """The whole residual vector, scaled to a squared length of the mean squared error; priors have no residuals."""
+    """`residuals` as Optimistix calls them."""
 
     problem: Problem
     pieces: Observations
     total: Scalar
 
     def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
-        model = self.problem.unknowns.model_from_real(self.problem.model, real)
-        adjoint, seen = adjoint_of(self.problem), seen_in_fit(model.scene, self.problem.settings, self.problem.leaps)
-
-        def of_piece(piece: Observations) -> Array:
-            scale = jnp.sqrt(piece.weight / self.total)
-            return jnp.stack([scale * c for c in residual(self.problem, model, piece, seen, adjoint)])
-
-        return jnp.ravel(jax.lax.map(of_piece, self.pieces)), None
+        return residuals(self.problem, real, self.pieces, self.total), None
 
 
 class Work:
@@ -86,7 +78,7 @@ class Work:
         self.rays = observations.size
         self.total = _total(observations)
         self.levels = _levels(problem, observations, chunk)
-        self.pieces = jax.tree.map(lambda x: x.reshape(-1, chunk, *x.shape[1:]), observations)
+        self.pieces = jax.tree.map(lambda x: on_devices(x.reshape(-1, chunk, *x.shape[1:])), observations)
         self.functions = self._functions(tuple(cameras), tuple(jnp.asarray(image) for image in images))
 
     def expand(self, level: int, real: Float[Array, "unknowns"]) -> tuple[float, Normal]:
@@ -156,8 +148,8 @@ class Work:
     def _sum(self, values: Float[Array, "unknowns"], observations: Observations, problem: Problem | None = None) -> Normal:
         """The normal equations of all chunks together, in float64."""
         problem = problem or self.problem
-        of_piece = functools.partial(normal_equations, problem, values, around=prepared(problem, values))
-        parts = in_threads(of_piece, observations.chunks(self.chunk))
+        around = prepared(problem, values)
+        parts = [normal_equations(problem, values, piece, around) for piece in observations.pieces(self.chunk)]
         return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
 
     def _functions(self, cameras: tuple[AbstractCamera, ...], images: tuple[Array, ...]) -> Functions:
@@ -179,7 +171,7 @@ def _levels(problem: Problem, observations: Observations, chunk: int) -> tuple[O
     """All observations, after a subset that still over-determines the unknowns where that is much smaller."""
     unknowns = sum(v.size for v in problem.unknowns.values(problem.model))
     every = min(MOST_THINNING, 3 * observations.size // max(LEAST_RESIDUALS * unknowns, chunk))
-    return (observations,) if every < 2 else (thin(observations, every, chunk), observations)
+    return (observations,) if every < 2 else (observations.thinned(every, chunk), observations)
 
 
 _mean_squares = eqx.filter_jit(value)

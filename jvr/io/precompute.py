@@ -14,13 +14,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jvr.atomic import replacing
 from jvr.effects.radiance_transfer import MaterialBleeding, ProjectedTransfer
 from jvr.effects.transfer_grid import TransferProjection, finished, project_all, transfer_of
+from jvr.execution.devices import everywhere, over_rays, shares
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.parallel import in_threads, workers
 from jvr.rendering.medium import absorbing, occupancy
 from jvr.rendering.settings import Settings
 
@@ -148,28 +149,26 @@ def _projection(scene: Scene) -> TransferProjection:
 
 
 def _project(scene: Scene, progress: Progress) -> ProjectedTransfer:
-    """The transfer of all nodes near which there is something to see, as many programs at a time as there are cores."""
+    """The transfer of all nodes near which there is something to see, some at a time."""
     projection = jax.jit(_projection)(scene)
     active = np.flatnonzero(np.asarray(projection.active()))
-    size = max(1, min(TOGETHER, -(-len(active) // workers())))
-    pieces = [active[i : i + size] for i in range(0, len(active), size)]
-    done = []
-
-    def one(piece: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        full = np.concatenate([piece, np.full(size - len(piece), piece[-1])])
-        coefficients, around = _some(projection, jnp.asarray(full, jnp.int32))
-        done.append(len(piece))
-        progress(sum(done) / len(active))
-        return np.asarray(coefficients)[: len(piece)], np.asarray(around)[: len(piece)]
-
     shape = jax.eval_shape(project_all, projection)
     coefficients, around = (np.zeros(x.shape, x.dtype) for x in shape)
-    for piece, (found, near) in zip(pieces, in_threads(one, pieces), strict=True):
-        coefficients[piece], around[piece] = found, near
+    size = shares() * min(TOGETHER, -(-len(active) // shares()))
+    for begin in range(0, len(active), size or 1):
+        piece = active[begin : begin + size]
+        # The last piece repeats its last node.
+        index = np.pad(piece, (0, size - len(piece)), mode="edge")
+        found = _some(projection, jnp.asarray(index, jnp.int32))
+        coefficients[index], around[index] = map(np.asarray, found)
+        progress((begin + len(piece)) / len(active))
     return jax.jit(finished)(scene, jnp.asarray(coefficients), jnp.asarray(around))
 
 
-_some = jax.jit(lambda projection, index: projection.nodes(index))
+@jax.jit
+def _some(projection: TransferProjection, index: Array) -> tuple[Array, Array]:
+    """The transfer of some nodes."""
+    return everywhere(over_rays(lambda projection, index: projection.nodes(index), projection, index))
 
 
 def _kept(

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 from jvr.march.batch import pooled_while
 from jvr.march.march import Marched, MarchOptions, Noted, integrate, march
 from jvr.march.medium import Medium, for_derivatives
-from jvr.march.rules import is_zero, values, wanted_and_fixed, with_zeros
+from jvr.march.rules import is_zero, wanted_and_fixed, with_zeros
 from jvr.march.segments import Lanes, Stretch, lanes_of, lit, places, resample, shown
 from jvr.march.steps import Rays, Sample, points_at, segment
 from jvr.march.sums import opacity, through, transmittance
@@ -54,23 +54,6 @@ def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
 
 replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
 
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def resumed_march(options: MarchOptions, done: tuple[Marched, Noted], medium: Medium, rays: Rays, dt: Scalar) -> Marched:
-    """`replay_march` where `integrate` has been through the same medium before: only the replay is left to do."""
-    return done[0]
-
-
-def _resumed_forward(options: MarchOptions, done: Any, *arguments: Any):
-    gathered, noted = values(done)
-    return gathered, (*wanted_and_fixed(arguments), noted)
-
-
-def _resumed_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
-    return None, *_replay_backward(options, residuals, cotangent)
-
-
-resumed_march.defvjp(_resumed_forward, _resumed_backward, symbolic_zeros=True)
 
 Inputs = tuple[Medium, Rays, Scalar]
 

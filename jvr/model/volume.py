@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from jvr.execution.devices import spread
 from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder
@@ -135,7 +136,7 @@ class Volume(eqx.Module):
             )
         if not (jnp.issubdtype(values.dtype, jnp.floating) or jnp.issubdtype(values.dtype, jnp.integer)):
             raise TypeError(f"voxels must be real or integer numbers, not {values.dtype}")
-        self.values, self.gaps = without_gaps(values, missing)
+        self.values, self.gaps = jax.tree.map(spread, without_gaps(values, missing))
         if jnp.issubdtype(values.dtype, jnp.floating):
             require(
                 self.values, lambda v: ~np.isinf(v), "voxels must not be infinite: replace them, by NaN where there are no data"

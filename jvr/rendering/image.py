@@ -1,25 +1,21 @@
 """`jvr.render`: a scene seen by a camera."""
 
-import functools
+import dataclasses
 import math
 import os
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.differentiation import Replay
+from jvr.execution.devices import everywhere, is_spread, is_traced, over_rays, program, shares
+from jvr.execution.tiles import block_shape, dealt_blocks, in_tiles, picture_of, pixels_of, within_memory
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.parallel import is_traced, program
-from jvr.rendering.medium import prepares_light
-from jvr.rendering.parts import all_blocks, block_shape, in_parts, joined, picture_of, pixels_of
-from jvr.rendering.reverse import reversible
 from jvr.rendering.sampling import RefinementStats, SliceStats
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Pixels, Seen, compiled_seen, develop, seen, trace
+from jvr.rendering.trace import Pixels, Seen, develop, seen, trace
 from jvr.types import Image
 
 
@@ -84,52 +80,35 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
 
 def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> Rendering:
     """`render` with every ray and every visible sample."""
-    if is_traced(()):
-        return _inside(scene, camera, settings)
-    if is_traced((scene, camera)):
-        # Inside of `jax.grad`, `jax.jvp` or `jax.vmap`, and of no program: they take a compiled one as a single operation.
-        if not isinstance(settings.adjoint, Replay) or prepares_light(scene):
-            return _one_program(scene, camera, settings)
-        made: Any = reversible(settings, scene, camera)
-        (rgb, alpha, depth), steps = made
-        return Rendering(rgb, alpha, depth, RenderStats(steps))
+    if is_traced() and not is_spread():
+        # A part of somebody's program, in which arrays that it closes over are constants.
+        return _render(scene, camera, settings)
+    if is_traced((scene, camera)) or is_spread():
+        # Inside of `jax.grad`, `jax.vmap` or `jax.shard_map` alone: they take a compiled program as a single operation.
+        return _picture(scene, camera, settings)
+    return within_memory(lambda tile: _picture(scene, camera, dataclasses.replace(settings, tile=tile)), settings.tile)
+
+
+def _render(scene: Scene, camera: AbstractCamera, settings: Settings) -> Rendering:
     height, width = camera.height, camera.width
-    where = compiled_seen(scene, settings)
-    part = functools.partial(_program, scene, camera, settings, where)
-    (rgb, alpha, depth), steps = joined(height, width, in_parts(part, height, width, settings.tile))
-    return Rendering(rgb, alpha, depth, RenderStats(steps, shadows=where.shadow_stats))
+    most = settings.tile // math.prod(block_shape(height, width))
 
+    def share(shared: tuple[Scene, AbstractCamera, Seen], blocks: Int[Array, "blocks"]) -> tuple[Pixels, Int[Array, "rays"]]:
+        return in_tiles(lambda tile: _render_blocks(*shared, settings, tile), blocks, most)
 
-def _inside(scene: Scene, camera: AbstractCamera, settings: Settings) -> Rendering:
-    """The picture as a part of a program."""
-    height, width = camera.height, camera.width
-    where = seen(scene, settings)
-    rays = _in_tiles(scene, camera, settings, where, all_blocks(height, width))
-    (rgb, alpha, depth), steps = picture_of(rays, height, width)
-    return Rendering(rgb, alpha, depth, RenderStats(steps, shadows=where.shadow_stats))
-
-
-_one_program = jax.jit(_inside, static_argnums=2)
+    prepared, dealt = seen(scene, settings), dealt_blocks(height, width, shares())
+    rays = everywhere(over_rays(share, (scene, camera, prepared), dealt))
+    (rgb, alpha, depth), steps = picture_of(rays, height, width, shares())
+    return Rendering(rgb, alpha, depth, RenderStats(steps, shadows=prepared.shadow_stats))
 
 
 def _render_blocks(
-    scene: Scene, camera: AbstractCamera, settings: Settings, where: Seen, blocks: Int[Array, "blocks"]
+    scene: Scene, camera: AbstractCamera, prepared: Seen, settings: Settings, blocks: Int[Array, "blocks"]
 ) -> tuple[Pixels, Int[Array, "rays"]]:
     pixels = pixels_of(blocks, camera.height, camera.width)
-    gathered, rays, t_in = trace(scene, camera, settings, pixels, where=where, distance=True)
+    gathered, rays, t_in = trace(scene, camera, settings, pixels, where=prepared, distance=True)
     assert gathered.steps is not None
     return develop(scene, gathered, rays, t_in), gathered.steps
 
 
-def _in_tiles(scene: Scene, camera: AbstractCamera, settings: Settings, where: Seen, blocks: Int[Array, "blocks"]):
-    """`_render_blocks`, at most `settings.tile` rays at a time."""
-    together = max(settings.tile // math.prod(block_shape(camera.height, camera.width)), 1)
-    if blocks.size <= together:
-        return _render_blocks(scene, camera, settings, where, blocks)
-    # The last tile repeats the last block; what it computes for it is dropped.
-    padded = jnp.pad(blocks, (0, -blocks.size % together), mode="edge").reshape(-1, together)
-    tiles = jax.lax.map(lambda tile: _render_blocks(scene, camera, settings, where, tile), padded)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tiles)
-
-
-_program = program(_render_blocks, static_argnums=2)
+_picture = program(_render, static_argnums=2)

@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 
+from jvr.execution.devices import cores, shares
 from jvr.march.quadrature import PreIntegrated
 from jvr.model.effects import describe
 from jvr.model.light import AmbientLight
@@ -22,6 +23,13 @@ def _skipping(volume: Volume, settings: Settings) -> str:
     if volume.bricks is None:
         return f"empty bricks{bound}; they are bounded anew for each picture: jvr.Volume.bricked() does it once"
     return f"empty bricks of {volume.bricks.size}^3 voxels{bound}"
+
+
+def _devices() -> str:
+    if shares() > 1:
+        return f"rays are spread over {shares()}"
+    idle = jax.default_backend() == "cpu" and cores() > 1
+    return f"one, of {cores()} cores: call jvr.use_all_cores() before anything is computed" if idle else "one"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +88,7 @@ def plan(scene: Scene, settings: Settings = Settings()) -> Plan:
         ),
         Part("clipping", scene.clipping is not None, "rays are cut" if scene.clipping is not None else "the scene names none"),
         Part("derivatives", True, f"{type(settings.adjoint).__name__}, if any are asked for"),
+        Part("devices", shares() > 1, _devices()),
     )
     return Plan(
         parts,

@@ -43,9 +43,6 @@ def seen(scene: Scene, settings: Settings) -> Seen:
     return Seen(where, visibility(scene, where), natural(scene))
 
 
-compiled_seen = jax.jit(seen, static_argnums=1)
-
-
 def trace(
     scene: Scene,
     camera: AbstractCamera,

@@ -1,0 +1,1 @@
+"""Rays over devices, and pictures as blocks of rays."""

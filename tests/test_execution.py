@@ -1,0 +1,151 @@
+"""Pictures and derivatives as one program, and their rays over devices."""
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import compiled, lut_transfer, perspective, render
+
+import jvr
+from jvr.execution import tiles
+
+
+def scene_of(seed, dtype=np.uint8, shape=(9, 7, 8)):
+    values = np.random.default_rng(seed).integers(0, 256, shape).astype(dtype)
+    return jvr.Scene(jvr.Volume(values, slope=1 / 255), lut_transfer(), background=(0.2, 0.1, 0.3))
+
+
+@pytest.mark.parametrize(("width", "height", "tile"), [(16, 13, 40), (5, 2, 1), (1, 1, 1)])
+def test_tiles_make_the_picture_of_one_piece(width, height, tile):
+    """Numbers of blocks that tiles do not divide, and tiles of less than a block."""
+    scene, camera = scene_of(0), perspective(jvr.Volume(np.zeros((9, 7, 8))), width, height)
+    ours, whole = jvr.render(scene, camera, jvr.Settings(0.7, tile=tile)), render(scene, camera, jvr.Settings(0.7))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), ours, whole)
+
+
+def test_arrays_that_a_traced_function_closes_over_are_part_of_it():
+    scene = scene_of(0)
+    camera = perspective(scene.volume, 8, 6)
+    traced = jax.make_jaxpr(lambda x: x + jvr.render(scene, camera).rgb)(0.0)
+    assert "while[" in str(traced)
+
+
+@pytest.mark.parametrize(("height", "width"), [(13, 10), (4, 8), (1, 7), (3, 2), (1, 1)])
+@pytest.mark.parametrize("shares", [1, 2, 5])
+def test_blocks_hold_every_pixel_once(height, width, shares):
+    order = tiles.pixels_of(tiles.dealt_blocks(height, width, shares), height, width)
+    index = np.arange(height * width).reshape(height, width)
+    assert order.size % shares == 0
+    np.testing.assert_array_equal(tiles.picture_of(order, height, width, shares), index)
+    # What is beside it, here another number for each ray, is dealt and joined alike.
+    np.testing.assert_array_equal(tiles.picture_of(jnp.stack([order, -order], 1), height, width, shares)[..., 1], -index)
+
+
+@pytest.mark.parametrize("shares", [1, 2, 3, 7])
+def test_things_are_dealt_in_turn_and_joined(shares):
+    order = tiles.dealt(5, shares)
+    assert [int(x) for x in order[: -(-5 // shares)]] == [min(k, 4) for k in range(0, shares * -(-5 // shares), shares)]
+    rows = jnp.repeat(order, 2)[:, None] * jnp.ones((1, 3))
+    np.testing.assert_array_equal(tiles.joined(rows, 5, shares), np.repeat(np.arange(5), 2)[:, None] * np.ones((1, 3)))
+
+
+def test_out_of_memory_halves_the_tile_with_one_warning():
+    sizes = []
+
+    def function(tile):
+        sizes.append(tile)
+        if tile > 20:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 bytes.")
+        return jnp.float32(tile)
+
+    with pytest.warns(RuntimeWarning, match="out of memory with 100 rays") as warned:
+        found = tiles.within_memory(function, 100)
+    assert found == 13
+    assert sizes == [100, 50, 25, 13]
+    assert len(warned) == 1
+
+
+@pytest.mark.parametrize(("message", "warns"), [("RESOURCE_EXHAUSTED: Out of memory", 1), ("INTERNAL: else", 0)])
+def test_what_does_not_fit_at_all_and_other_failures_are_raised(message, warns, recwarn):
+    def function(_):
+        raise jax.errors.JaxRuntimeError(message)
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match=message.split(":")[0]):
+        tiles.within_memory(function, 8)
+    assert len([w for w in recwarn if "out of memory" in str(w.message)]) == warns
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "lit"), [(jvr.Replay(), False), pytest.param(jvr.Replay(), True, marks=pytest.mark.slow), (jvr.Rows(), False)]
+)
+def test_a_derivative_outside_of_jit_is_that_of_one_program(x64, adjoint, lit):
+    """In everything that is an array of a picture that tiles do not divide, and compiled once."""
+    scene = scene_of(1, np.float64)
+    camera = perspective(scene.volume, 7, 5)
+    if lit:
+        lights = (jvr.PointLight((20.0, -5.0, 9.0), 300.0), jvr.AmbientLight(0.3))
+        scene = jvr.Scene(scene.volume, scene.transfer, lights=lights, shading=jvr.BlinnPhong(), shadows=jvr.ShadowVolume())
+    settings = jvr.Settings(0.7, adjoint=adjoint, tile=20)
+    into = (lambda s: s.transfer.rgb) if isinstance(adjoint, jvr.Rows) else (lambda s: (s.transfer, s.volume.values))
+
+    def loss(arrays):
+        picture = jvr.render(eqx.tree_at(into, scene, arrays), camera, settings)
+        return jnp.sum(jnp.sin(picture.rgb)) + jnp.sum(picture.alpha) + jnp.sum(picture.depth)
+
+    of = jax.value_and_grad(loss)
+    ours, whole = of(into(scene)), compiled(of)(into(scene))
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-11 * float(jnp.max(jnp.abs(b))))
+    jax.tree.map(close, ours, whole)
+    with jax.log_compiles(), compilations() as names:
+        of(into(scene))
+    assert names == []
+
+
+def test_one_compilation_while_only_arrays_change():
+    camera = perspective(jvr.Volume(np.zeros((9, 7, 8))), 12, 9)
+    jvr.render(scene_of(0), camera)
+    with jax.log_compiles(), compilations() as names:
+        for seed in range(1, 4):
+            jvr.render(scene_of(seed), camera)
+    assert names == []
+
+
+def test_one_device_says_what_to_do():
+    devices = next(part for part in jvr.plan(scene_of(0)).parts if part.name == "devices")
+    assert not devices.included
+    assert "one" in devices.reason
+
+
+def test_cores_are_asked_for_too_late(monkeypatch):
+    monkeypatch.setattr("jvr.execution.devices.cores", lambda: 7)
+    with pytest.warns(RuntimeWarning, match=r"1 of 7 cores: call jvr.use_all_cores\(\) before"):
+        jvr.use_all_cores()
+
+
+def test_rays_over_three_devices():
+    """Everything in `devices.py`, in a process whose processor is three devices."""
+    cases = Path(__file__).with_name("devices.py")
+    flags = ["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    environment = os.environ | {"JVR_TEST_DEVICES": "3"}
+    ran = subprocess.run([sys.executable, "-m", "pytest", str(cases), *flags], capture_output=True, text=True, env=environment)
+    assert ran.returncode == 0, ran.stdout[-4000:]
+
+
+class compilations:
+    """What is compiled meanwhile."""
+
+    def __enter__(self):
+        self.names, self.handler = [], logging.Handler()
+        self.handler.emit = lambda record: self.names.append(record.getMessage()) if "Compiling" in record.getMessage() else None
+        logging.getLogger("jax").addHandler(self.handler)
+        return self.names
+
+    def __exit__(self, *_):
+        logging.getLogger("jax").removeHandler(self.handler)
