@@ -1,11 +1,13 @@
 """The measurements, one function each; every one returns a flat dictionary of numbers."""
 
+import functools
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -102,25 +104,32 @@ def skipping() -> dict[str, Any]:
 
 
 def devices() -> dict[str, Any]:
-    """Image and gradient in a transfer function, over all cores and over one, within the caller's own `jax.jit`, each of one program."""
-    volume, settings, found = scenes.gyroid(), jvr.Settings(0.5), {}
-    for kind, transfer in {"opaque": scenes.opaque(), "translucent": scenes.translucent()}.items():
+    """Image and gradient in a transfer function within the caller's own `jax.jit`: over all devices, over the first alone."""
+    found, settings = {}, jvr.Settings(0.5)
+    for kind, transfer in {"opaque": scenes.opaque, "translucent": scenes.translucent}.items():
         for size in (128, 400):
-            scene, camera = jvr.Scene(volume, transfer), scenes.camera(volume, size)
-            loss = lambda t, scene=scene, camera=camera: jnp.mean(
-                jnp.square(jvr.render(eqx.tree_at(lambda s: s.transfer, scene, t), camera, settings).rgb - 0.5)
-            )
-            functions: dict[str, Any] = {}
-            for name, of in (("image", loss), ("gradient", jax.value_and_grad(loss))):
-                everywhere = jax.jit(of)
-                functions[f"{name}_all"] = lambda f=everywhere, t=transfer: f(t)
-                with jax.default_device(jax.devices()[0]):
-                    lowered = jax.jit(of).lower(transfer).compile()
-                functions[f"{name}_one"] = lambda f=lowered, t=transfer: f(t)
-            times = seconds(functions)
-            for name in ("image", "gradient"):
-                found[f"{kind}_{size}_{name}_all_over_one"] = ratio(times, f"{name}_all", f"{name}_one")
+            functions = _of_size(transfer, size, settings)
+            with jax.default_device(jax.devices()[0]):
+                alone = _of_size(transfer, size, settings)
+            for name in functions:
+                times = seconds({"all": functions[name], "one": functools.partial(_alone, alone[name])})
+                found[f"{kind}_{size}_{name}_all_over_one"] = ratio(times, "all", "one")
     return found
+
+
+def _of_size(transfer: Callable[[], Any], size: int, settings: jvr.Settings) -> dict[str, Callable[[], Any]]:
+    """Image and gradient of a gyroid."""
+    scene = jvr.Scene(scenes.gyroid(), transfer())
+    camera = scenes.camera(scene.volume, size)
+    draw = lambda t, volume: jvr.render(eqx.tree_at(lambda s: (s.volume, s.transfer), scene, (volume, t)), camera, settings).rgb
+    loss = jax.jit(jax.value_and_grad(lambda t, volume: jnp.mean(jnp.square(draw(t, volume) - 0.5))))
+    image = jax.jit(draw)
+    return {"image": lambda: image(scene.transfer, scene.volume), "gradient": lambda: loss(scene.transfer, scene.volume)}
+
+
+def _alone(function: Callable[[], Any]) -> Any:
+    with jax.default_device(jax.devices()[0]):
+        return function()
 
 
 def memory() -> dict[str, Any]:

@@ -4,6 +4,9 @@ import os
 from pathlib import Path
 
 os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "false")
+# Most of the time goes into compiling programs that run for a moment: a quarter of it without what makes them fast.
+CHEAP = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+os.environ["XLA_FLAGS"] = f"{CHEAP} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 from jaxtyping import install_import_hook
 

@@ -13,6 +13,8 @@ from scenes import lut_transfer, perspective
 import jvr
 from jvr.execution import devices
 
+slow = pytest.mark.slow
+
 
 @functools.cache
 def plain():
@@ -55,8 +57,15 @@ def test_there_are_three():
         assert on_one_device(devices.shares) == 1
 
 
-@pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("size", [(15, 13), (1, 1)])
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("plain", (15, 13)),
+        ("plain", (1, 1)),
+        ("shadow volume", (15, 13)),
+        *(pytest.param(name, (15, 13), marks=slow) for name in ("tiles", "refinement", "shadow rays", "deep map")),
+    ],
+)
 def test_pictures(name, size):
     make, settings = SCENES[name]
     scene, camera = make(), perspective(plain().volume, *size)
@@ -64,8 +73,13 @@ def test_pictures(name, size):
     close(draw(scene, camera), on_one_device(draw, scene, camera))
 
 
-@pytest.mark.parametrize("name", ["plain", "shadow volume", "shadow rays"])
-@pytest.mark.parametrize("by", ["eager", "jit"])
+@pytest.mark.parametrize(
+    ("name", "by"),
+    [
+        ("plain", "eager"),
+        *(pytest.param(*case, marks=slow) for case in (("plain", "jit"), ("shadow volume", "eager"), ("shadow rays", "jit"))),
+    ],
+)
 def test_gradients_in_everything(name, by):
     make, settings = SCENES[name]
     scene, camera = make(), perspective(plain().volume, 15, 13)
@@ -75,7 +89,7 @@ def test_gradients_in_everything(name, by):
     close(gradient(arrays), on_one_device(gradient, arrays), 2e-4)
 
 
-@pytest.mark.parametrize("adjoint", [jvr.Forward(), jvr.Rows()])
+@pytest.mark.parametrize("adjoint", [jvr.Forward(), pytest.param(jvr.Rows(), marks=slow)])
 def test_tangents(adjoint):
     scene, camera = plain(), perspective(plain().volume, 9, 5)
     of = lambda sigma: (
@@ -93,7 +107,7 @@ def test_vmap():
     close(jax.vmap(of)(both), jnp.stack([of(rgb) for rgb in both]))
 
 
-@pytest.mark.parametrize("keep", [True, False])
+@pytest.mark.parametrize("keep", [True, pytest.param(False, marks=slow)])
 def test_fits(keep):
     scene, cameras = plain(), [perspective(plain().volume, 12, 9), perspective(plain().volume, 7, 10)]
     images = [np.asarray(jvr.render(scene, camera).rgb) for camera in cameras]

@@ -129,10 +129,11 @@ def test_cores_are_asked_for_too_late(monkeypatch):
         jvr.use_all_cores()
 
 
-def test_rays_over_three_devices():
-    """Everything in `devices.py`, in a process whose processor is three devices."""
+@pytest.mark.parametrize("which", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
+def test_rays_over_three_devices(which):
+    """The cases of `devices.py`, in a process whose processor is three devices."""
     cases = Path(__file__).with_name("devices.py")
-    flags = ["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    flags = ["-q", "-x", "-m", which, "-p", "no:cacheprovider", "-p", "no:xdist"]
     environment = os.environ | {"JVR_TEST_DEVICES": "3"}
     ran = subprocess.run([sys.executable, "-m", "pytest", str(cases), *flags], capture_output=True, text=True, env=environment)
     assert ran.returncode == 0, ran.stdout[-4000:]

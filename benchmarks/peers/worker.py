@@ -112,6 +112,8 @@ def main() -> None:
     module, kind = KINDS[name]
     try:
         loaded = importlib.import_module(f"benchmarks.peers.{module}")
+        if hasattr(loaded, "jvr"):
+            loaded.jvr.use_all_cores()
         pipe.send((None, loaded.version()))
     except ImportError as error:
         pipe.send(("ImportError", str(error)))

@@ -165,11 +165,10 @@ def depth_nodes(
     """Optical depth from the light to `layers + 1` equally distant depths of `texels^2` rays, by the midpoint rule with `samples` samples a
     layer, swept away from the light."""
     axis = jnp.linspace(-1.0, 1.0, texels)
-    places = tuple(c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij"))
-    fill = -(texels**2) % shares()
-    places = tuple(jnp.pad(c, (0, fill), mode="edge") for c in places)
+    places = jnp.stack([c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij")], axis=1)
+    places = jnp.pad(places, ((0, -(texels**2) % shares()), (0, 0)), mode="edge")
 
-    def share(shared: tuple[AbstractLightSpace, Scene, Medium], places: tuple[Array, Array]) -> Array:
+    def share(shared: tuple[AbstractLightSpace, Scene, Medium], places: Float[Array, "rays 2"]) -> Array:
         return _swept(*shared, places, layers, samples)
 
     swept = over_rays(share, (space, scene, medium), places)
@@ -180,12 +179,12 @@ def _swept(
     space: AbstractLightSpace,
     scene: Scene,
     medium: Medium,
-    places: tuple[Float[Array, "rays"], Float[Array, "rays"]],
+    places: Float[Array, "rays 2"],
     layers: int,
     samples: int,
 ) -> Float[Array, "rays nodes channels"]:
     """`depth_nodes` of the rays in some places `(u, v)`."""
-    u, v = places
+    u, v = places.T
     rays = rays_through(space, scene, u, v)
     together = min(max(1, SWEPT // (u.size * samples)), layers)
     blocks = -(-layers // together)
