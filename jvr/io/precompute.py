@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jvr.atomic import replacing
-from jvr.effects.radiance_transfer import MaterialBleeding, ProjectedTransfer
+from jvr.effects.projected_transfer import ProjectedTransfer
+from jvr.effects.radiance_transfer import MaterialBleeding
 from jvr.effects.transfer_grid import TransferProjection, finished, project_all, transfer_of
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
