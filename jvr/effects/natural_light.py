@@ -204,7 +204,16 @@ def natural_light_of(scene: Scene) -> NaturalLight:
     material: HarmonicMaterial = scene.material.projected(scene.material_order)
     exact = scene.radiance_transfer is not None and scene.radiance_transfer.exact
     order = material.order if exact else min(material.order, environment.order)
-    shadow = own_shadow_of(scene)
+    shadow = own_shadow_of(scene, albedo_of(scene))
     return natural_light(
         material, environment.coefficients, clamped=environment.clamped, order=order, from_samples=exact, shadow=shadow
     )
+
+
+def albedo_of(scene: Scene) -> NaturalLight | None:
+    """A scene's material under light of one from everywhere, where rays of its radiance transfer pick up what it reflects."""
+    if scene.radiance_transfer is None or not scene.radiance_transfer.needs_gradient:
+        return None
+    assert scene.material is not None
+    everywhere = jnp.full((1, 3), math.sqrt(4 * math.pi), scene.volume.slope.dtype)
+    return natural_light(scene.material.projected(0), everywhere, clamped=True, order=0, from_samples=False)

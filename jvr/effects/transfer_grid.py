@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.effects.grid import Grid
-from jvr.effects.natural_light import NaturalLight, natural_light
+from jvr.effects.natural_light import NaturalLight, albedo_of
 from jvr.effects.projected_transfer import ProjectedTransfer
-from jvr.effects.radiance_transfer import MaterialBleeding, RadianceTransfer
+from jvr.effects.radiance_transfer import RadianceTransfer
 from jvr.effects.transfer_nodes import CHUNK, node_positions, project_nodes
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
@@ -101,14 +101,10 @@ class TransferProjection(eqx.Module):
     @classmethod
     def of(cls, scene: Scene, medium: Medium) -> "TransferProjection":
         """`medium`: what the scene's rays of light pass."""
-        transfer, albedo = transfer_of(scene), None
+        transfer = transfer_of(scene)
         transfer.check_memory(scene.volume, scene.transfer)
-        if isinstance(transfer.bleeding, MaterialBleeding):
-            assert scene.material is not None
-            everywhere = jnp.full((1, 3), math.sqrt(4 * math.pi), scene.volume.slope.dtype)
-            albedo = natural_light(scene.material.projected(0), everywhere, clamped=True, order=0, from_samples=False)
         assert scene.material is not None
-        return cls(transfer, scene.volume, scene.clipping, medium, albedo, scene.material.needs_gradient)
+        return cls(transfer, scene.volume, scene.clipping, medium, albedo_of(scene), scene.material.needs_gradient)
 
     def positions(self) -> np.ndarray:
         return node_positions(self.volume, self.transfer.shape(self.volume))
