@@ -137,6 +137,33 @@ def smaller(a: Float[Array, "..."], b: Float[Array, "..."] | float) -> Float[Arr
     return jnp.where(a > b, b, a)
 
 
+def clamp(
+    x: Float[Array, "..."], low: Float[Array, ""] | float | int, high: Float[Array, ""] | float | int
+) -> Float[Array, "..."]:
+    """`x`, no less than `low` and no more than `high`. From one to the other, both included, the derivative is that of `x`.
+
+    `jnp.clip` has half of it at the ends, where data often lie: background at the first entry of a table, labels at every entry.
+    """
+    low, high = (jnp.asarray(end, x.dtype) for end in (low, high))
+    return _clamp(x, low, high)
+
+
+@jax.custom_jvp
+def _clamp(x: Float[Array, "..."], low: Float[Array, ""], high: Float[Array, ""]) -> Float[Array, "..."]:
+    return jnp.clip(x, low, high)
+
+
+@_clamp.defjvp
+def _clamp_jvp(primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    (x, low, high), (dx, dlow, dhigh) = primals, tangents
+    return _clamp(x, low, high), jnp.where(x < low, dlow, jnp.where(x > high, dhigh, dx))
+
+
+def rounded_into(x: Float[Array, "..."], low: Float[Array, ""] | float, high: Float[Array, ""] | float) -> Float[Array, "..."]:
+    """`x` between `low` and `high`, which it leaves by a rounding at most where it matters: the derivative is that of `x` everywhere."""
+    return x + jax.lax.stop_gradient(jnp.clip(x, low, high) - x)
+
+
 def ray_box(origin: Triple, direction: Triple, lower: Corner, upper: Corner) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Distances at which a ray enters and leaves an axis-aligned box (slab method, Kay and Kajiya 1986).
 

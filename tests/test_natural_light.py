@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+import shutil
 
 import equinox as eqx
 import jax
@@ -329,6 +330,26 @@ def test_computed_beforehand_and_in_the_picture_are_the_same(tmp_path):
     for path in kept:
         path.write_bytes(path.read_bytes()[:100])
     np.testing.assert_allclose(picture(jvr.precompute(lit, cache=tmp_path)), picture(lit), atol=1e-5)
+
+
+def test_what_is_kept_may_be_deleted_at_any_time(tmp_path):
+    """One file, all of the folder, or the folder while a result is on its way to it."""
+    folder, lit = tmp_path / "kept", scene(transfer=jvr.RadianceTransfer(0, rays=1, resolution=0.1), shape=(4, 4, 4))
+
+    def cached(lit, after=lambda part: None):
+        parts = []
+        jvr.precompute(lit, cache=folder, report=lambda part: (parts.append(part), after(part)))
+        return [part.cached for part in parts]
+
+    plain = dataclasses.replace(lit, radiance_transfer=None)
+    assert cached(plain) == [False]
+    assert cached(plain) == [True]
+    next(folder.glob("*.npz")).unlink()
+    assert cached(plain) == [False]
+    shutil.rmtree(folder)
+    assert cached(plain) == [False]
+    with pytest.warns(RuntimeWarning, match="radiance transfer is used and not kept"):
+        assert cached(lit, lambda part: shutil.rmtree(folder, ignore_errors=True)) == [True, False]
 
 
 @pytest.mark.parametrize("bleeding", [None, pytest.param(jvr.MaterialBleeding(), marks=pytest.mark.slow)])

@@ -12,6 +12,9 @@ from scenes import OBLIQUE, affine, compiled, linear_transfer, perspective, voxe
 from scenes import render_quickly as render
 
 import jvr
+from jvr.march.fields import VoxelField
+from jvr.march.shaders import GradientFrame
+from jvr.march.steps import Point
 
 SCHEMES = (
     jvr.AnalyticGradient,
@@ -188,6 +191,37 @@ def test_constants_have_no_gradient(scheme):
         volume = jvr.Volume(np.full(shape, value, np.float32), slope=slope, intercept=intercept)
         found = gradients(scheme(), volume, everywhere(shape, 400))
         np.testing.assert_array_equal(found, 0.0)
+
+
+@pytest.mark.parametrize("scheme", [jvr.SobelDifferences, pytest.param(jvr.CentralDifferences, marks=pytest.mark.slow)])
+def test_rounding_decides_no_normal_of_an_opacity(scheme):
+    """What is flat has none: a constant under a steep transfer function, and a scalar that rises where opacity is a plateau."""
+    shape, normals = (6, 7, 8), scheme(True)
+    points, slope = everywhere(shape, 300), np.array([0.07, 0.05, 0.03])
+    rising = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1) @ slope
+    plateau = jvr.LinearTransfer([-1e3, 0.6, 0.7, 1e3], np.ones((4, 3)), [0.7, 0.7, 1.9, 1.9])
+    steep = jvr.LinearTransfer([0.29, 0.3, 0.31, 0.32], np.ones((4, 3)), [0.0, 90.0, 3.0, 700.0])
+    volume = lambda s: jvr.Volume((s + 0.81) / 3.7, slope=3.7, intercept=-0.81)
+    assert not np.any(_in_world(volume(np.full(shape, 0.301)), normals, steep, jnp.asarray(points)))
+    found = np.any(np.asarray(_in_world(volume(rising), normals, plateau, jnp.asarray(points))), axis=1)
+    # A neighbour farther off in all three directions, and what rounding makes of it.
+    flat, rises = points @ slope + slope.sum() < 0.599, np.abs(points @ slope - 0.65) < 0.04
+    assert flat.sum() > 100
+    assert not np.any(found[flat])
+    assert np.all(found[rises])
+
+
+@compiled
+def _in_world(volume, normals, transfer, points):
+    """Gradients as shaders take them."""
+    frame = GradientFrame(normals, volume.axes_inverse, volume.intercept, volume.shape)
+    field = VoxelField(volume, normals.prepared(volume, transfer))
+
+    def one(p):
+        point = Point(tuple(p), tuple(p), jnp.int32(0), jnp.int32(0))
+        return jnp.stack(frame.in_world(transfer, field.resample(point), point).gradient)
+
+    return jax.vmap(one)(points)
 
 
 DEFAULT = [(jvr.PrecomputedGradient, True)]

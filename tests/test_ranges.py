@@ -146,6 +146,42 @@ def test_constructors_refuse_what_the_range_excludes(made):
         made()
 
 
+# One number, made with it, and the end of its range that a constructor knows.
+DECLARED = {
+    "roughness": (lambda x: jvr.MicrofacetBRDF(roughness=x), 0.001),
+    "diameter": (jvr.JendersieEon, 5.0),
+    "eta": (lambda x: jvr.Dipole([1.0] * 3, [0.1] * 3, x), 1.0),
+    "shininess": (lambda x: jvr.BlinnPhong(shininess=x), 1.0),
+}
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_constructors_and_fits_keep_to_one_range(name):
+    """Up to its very end, and not a part in a thousand farther."""
+    make, end = DECLARED[name]
+    np.testing.assert_allclose(getattr(make(end), name), end)
+    with pytest.raises(ValueError, match="must"):
+        make(end * (1 - 1e-4))
+
+
+def test_attenuation_has_a_range_for_each_entry():
+    """A part that is zero, as constructors take it, is where a fit that keeps to bounds starts; the constant stays above zero."""
+    lit = eqx.tree_at(lambda s: POINT(s).attenuation, SCENE, jnp.array([1.0, 0.0, 0.2]))
+    model = Exposed(lit, None)
+    chosen = choose_unknowns(model, lambda m: POINT(m.scene).attenuation, None, ANY)
+    start = chosen.real_from_model(model)
+    np.testing.assert_array_equal(chosen.values_from_real(start, model), np.float32([1.0, 0.0, 0.2]))
+    lowest = chosen.values_from_real(jnp.asarray(chosen.limits(model, np.asarray(start))[0]), model)
+    np.testing.assert_array_equal(lowest[1:], 0.0)
+    assert 0 < lowest[0] < 1e-5
+    for wrong in ((0.0, 1.0, 1.0), (1.0, -0.1, 0.0), (1.0, 0.0, np.nan)):
+        with pytest.raises(ValueError, match="attenuation"):
+            jvr.PointLight((0, 0, 0), attenuation=wrong)
+    negative = eqx.tree_at(lambda s: POINT(s).attenuation, SCENE, jnp.array([1.0, -0.5, 0.2]))
+    with pytest.raises(ValueError, match=r"attenuation starts at -0\.5"):
+        choose_unknowns(Exposed(negative, None), lambda m: POINT(m.scene).attenuation)
+
+
 @pytest.mark.slow
 def test_a_bounded_solver_keeps_negative_positions():
     transfer = jvr.LinearTransfer([-0.5, 0.4, 0.9], [[0.9, 0.1, 0.1], [0.1, 0.9, 0.2], [0.2, 0.3, 0.9]], [0.1, 0.4, 0.2])

@@ -1,8 +1,9 @@
-"""Surfaces where a clipping box cuts the medium open (Weiskopf, Engel and Ertl, "Interactive clipping techniques for texture-based volume
-visualization and volume shading", IEEE TVCG 9(3), 2003, section 5).
+"""Surfaces where a clipping box cuts the medium open.
 
 Inside of what is cut the gradient is that of noise, and within a voxel of the cut it is made of voxels that are not there. A layer behind
-each face of the box is therefore shaded with the normal of the face.
+each face of the box is therefore shaded with the normal of the face. That a cut is lit as a surface and what lies behind it by its gradient
+is after Weiskopf, Engel and Ertl, "Interactive clipping techniques for texture-based volume visualization and volume shading" (IEEE TVCG
+9(3), 2003, pages 298-312); how deep the layer is, and how one goes over into the other, is not taken from there.
 """
 
 import equinox as eqx

@@ -21,7 +21,7 @@ from jvr.march.steps import Point
 from jvr.model.light import AbstractLight, DirectionalLight, perpendicular
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.numerics import direction_and_length, dot, larger, ray_box, smaller
+from jvr.numerics import clamp, direction_and_length, dot, larger, ray_box, rounded_into, smaller
 from jvr.types import Channels, Scalar, Triple, Vector
 
 # A light nearer to the bounding sphere of the volume than this share of its radius shines in all directions.
@@ -153,7 +153,7 @@ def depth_between(
     middle, inside = 0.5 * (low + high), high > low
     p = (s + middle * d for s, d in zip(rays.start, rays.direction, strict=True))
     # Where nothing is inside, and by a rounding elsewhere, the middle may be outside, where nothing may be read.
-    p = tuple(jnp.clip(c, first, last) for c, first, last in zip(p, *volume.domain, strict=True))
+    p = tuple(rounded_into(c, first, last) for c, first, last in zip(p, *volume.domain, strict=True))
     point = Point(p, rays.direction, *(jnp.zeros_like(middle, jnp.int32),) * 2)
     sigma_t = classify_at(medium, point, inside)[0].sigma_t
     return tuple(jnp.where(inside, sigma * (high - low), 0.0) for sigma in sigma_t)
@@ -210,7 +210,7 @@ def _swept(
 
 def bilinear(texels: int, u: Scalar, v: Scalar) -> list[tuple[Array, Scalar]]:
     """The four texels around `(u, v)`, as flat indices, with their weights; positions beyond the border count as on it."""
-    at = [jnp.clip((c + 1) / 2 * (texels - 1), 0, texels - 1) for c in (u, v)]
+    at = [clamp((c + 1) / 2 * (texels - 1), 0, texels - 1) for c in (u, v)]
     low = [jnp.clip(jnp.floor(c), 0, texels - 2) for c in at]
     (fu, fv), (i, j) = [c - b for c, b in zip(at, low, strict=True)], [b.astype(jnp.int32) for b in low]
     return [((i + a) * texels + j + b, (fu if a else 1 - fu) * (fv if b else 1 - fv)) for a in (0, 1) for b in (0, 1)]

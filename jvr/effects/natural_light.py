@@ -23,7 +23,7 @@ from jvr.effects.shading import share_of
 from jvr.model.harmonics.basis import band_of, basis, count
 from jvr.model.material import About, HarmonicMaterial, Lobe
 from jvr.model.scene import Scene
-from jvr.numerics import direction_and_length, dot
+from jvr.numerics import clamp, direction_and_length, dot, larger
 from jvr.types import Channels, Scalar, Triple
 
 
@@ -59,7 +59,7 @@ class PlaneTable(eqx.Module):
         classes, polar, _ = self.rows.shape
         # What has one entry is not looked up: the compiler could not know that there is nothing to choose.
         kinds = _between(place[0], place[1]) if classes > 1 else [(0, 1.0)]
-        x = jnp.clip(theta / (math.pi / 2) * (polar - 1), 0, polar - 1)
+        x = clamp(theta / (math.pi / 2) * (polar - 1), 0, polar - 1)
         low = jnp.clip(jnp.floor(x), 0, max(polar - 2, 0))
         angles = _between(low.astype(jnp.int32), x - low) if polar > 1 else [(0, 1.0)]
         row = sum(v * w * self.rows[i, j] for i, v in kinds for j, w in angles)
@@ -129,7 +129,7 @@ class NaturalLight(eqx.Module):
             scales = [kept[0], *(tuple(counts * k for k in band) for band in kept[1:])]
             radiance = _integrate(table.at(place, theta), coefficients, table.directions(normal, across, w_o), scales)
             radiance = tuple(c * r for c, r in zip(share, radiance, strict=True))
-            parts.append(tuple(jnp.maximum(r, 0.0) for r in radiance) if self.clamped else radiance)
+            parts.append(tuple(larger(r, 0.0) for r in radiance) if self.clamped else radiance)
         return parts[0], parts[1]
 
     def _light(self, arriving: Channels, s: Scalar) -> tuple[list[Triple], Triple]:
@@ -204,7 +204,16 @@ def natural_light_of(scene: Scene) -> NaturalLight:
     material: HarmonicMaterial = scene.material.projected(scene.material_order)
     exact = scene.radiance_transfer is not None and scene.radiance_transfer.exact
     order = material.order if exact else min(material.order, environment.order)
-    shadow = own_shadow_of(scene)
+    shadow = own_shadow_of(scene, albedo_of(scene))
     return natural_light(
         material, environment.coefficients, clamped=environment.clamped, order=order, from_samples=exact, shadow=shadow
     )
+
+
+def albedo_of(scene: Scene) -> NaturalLight | None:
+    """A scene's material under light of one from everywhere, where rays of its radiance transfer pick up what it reflects."""
+    if scene.radiance_transfer is None or not scene.radiance_transfer.needs_gradient:
+        return None
+    assert scene.material is not None
+    everywhere = jnp.full((1, 3), math.sqrt(4 * math.pi), scene.volume.slope.dtype)
+    return natural_light(scene.material.projected(0), everywhere, clamped=True, order=0, from_samples=False)

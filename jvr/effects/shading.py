@@ -16,7 +16,7 @@ from jvr.model.by_value import ByValue, coefficient
 from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractShading
 from jvr.model.ranges import NOT_NEGATIVE, Interval, within
-from jvr.numerics import direction_and_length, divide_or_zero, dot, power_of_cosine
+from jvr.numerics import direction_and_length, divide_or_zero, dot, larger, power_of_cosine, smaller
 from jvr.types import ArrayLike, Scalar, Triple
 
 # Of Phong's lobes.
@@ -132,8 +132,8 @@ class BlinnPhong(Phong):
 
 def share_of(magnitude: Float[Array, "..."], threshold: Scalar) -> Float[Array, "..."]:
     """`m^2 / (m^2 + t^2)`, by the ratio of the smaller to the larger, so that no square overflows; 0 where `m` is 0."""
-    larger, smaller = jnp.maximum(magnitude, threshold), jnp.minimum(magnitude, threshold)
-    ratio = jnp.square(divide_or_zero(smaller, larger))
+    # Where both are the same, one has the derivative of the magnitude and the other that of the threshold.
+    ratio = jnp.square(divide_or_zero(smaller(threshold, magnitude), larger(magnitude, threshold)))
     share = jnp.where(magnitude >= threshold, 1 / (1 + ratio), ratio / (1 + ratio))
     # A gradient that vanishes has no normal, whatever the threshold.
     return jnp.where(magnitude > 0, share, jax.lax.stop_gradient(jnp.zeros_like(magnitude)))

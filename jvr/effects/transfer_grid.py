@@ -11,21 +11,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.effects.grid import Grid
-from jvr.effects.natural_light import NaturalLight, natural_light
-from jvr.effects.radiance_transfer import (
-    CHUNK,
-    MaterialBleeding,
-    ProjectedTransfer,
-    RadianceTransfer,
-    node_positions,
-    project_nodes,
-)
+from jvr.effects.natural_light import NaturalLight, albedo_of
+from jvr.effects.projected_transfer import ProjectedTransfer
+from jvr.effects.radiance_transfer import RadianceTransfer
+from jvr.effects.transfer_nodes import CHUNK, node_positions, project_nodes
 from jvr.execution.devices import over_rays, shares
 from jvr.execution.tiles import dealt, joined
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.harmonics.algebra import product_matrix
-from jvr.model.harmonics.basis import band_of, basis, count
+from jvr.model.harmonics.basis import band_of, basis
 from jvr.model.scene import Scene
 from jvr.model.volume import ClippingBox, Volume
 from jvr.numerics import direction_and_length, divide_or_zero
@@ -108,14 +103,10 @@ class TransferProjection(eqx.Module):
     @classmethod
     def of(cls, scene: Scene, medium: Medium) -> "TransferProjection":
         """`medium`: what the scene's rays of light pass."""
-        transfer, albedo = transfer_of(scene), None
+        transfer = transfer_of(scene)
         transfer.check_memory(scene.volume, scene.transfer)
-        if isinstance(transfer.bleeding, MaterialBleeding):
-            assert scene.material is not None
-            everywhere = jnp.full((1, 3), math.sqrt(4 * math.pi), scene.volume.slope.dtype)
-            albedo = natural_light(scene.material.projected(0), everywhere, clamped=True, order=0, from_samples=False)
         assert scene.material is not None
-        return cls(transfer, scene.volume, scene.clipping, medium, albedo, scene.material.needs_gradient)
+        return cls(transfer, scene.volume, scene.clipping, medium, albedo_of(scene), scene.material.needs_gradient)
 
     def positions(self) -> np.ndarray:
         return node_positions(self.volume, self.transfer.shape(self.volume))
@@ -174,7 +165,7 @@ def finished(
     grid, around = coefficients.reshape(*shape, *coefficients.shape[1:]), around.reshape(*shape, 4)
     projected = ProjectedTransfer(grid, None, around[..., 0], around[..., 1:], scene.transfer, made_for)
     projected = projected if transfer.scattering is None else scattered(scene, projected)
-    return projected if transfer.chromaticity is None else _separated(projected, transfer.chromaticity)
+    return projected if transfer.chromaticity is None else projected.separated(transfer.chromaticity)
 
 
 def scattered(scene: Scene, projected: ProjectedTransfer) -> ProjectedTransfer:
@@ -185,14 +176,6 @@ def scattered(scene: Scene, projected: ProjectedTransfer) -> ProjectedTransfer:
     there = projected.solid > 0
     coefficients = scatter(transfer.scattering, transfer.neighbourhood, scene.volume, projected.coefficients, there)
     return dataclasses.replace(projected, luminance=coefficients, chroma=None, scattered=True)
-
-
-def _separated(projected: ProjectedTransfer, order: int) -> ProjectedTransfer:
-    """Luma, and colour differences up to an order (YCoCg, whose inverse is exact)."""
-    red, green, blue = jnp.moveaxis(projected.coefficients, 3, 0)
-    luma = 0.25 * (red + blue) + 0.5 * green
-    chroma = jnp.stack([0.5 * (red - blue), green - luma], axis=3)[..., : count(order)]
-    return dataclasses.replace(projected, luminance=luma[..., None, :], chroma=chroma)
 
 
 def _shares(

@@ -5,6 +5,7 @@ need a smooth map from the whole real line into the range.
 """
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.model.ranges import Increasing, Interval, Range, UnitVector
-from jvr.numerics import normalise
+from jvr.model.ranges import Entries, Increasing, Interval, Range, UnitVector
+from jvr.numerics import normalise, rounded_into
 
 # How near to the end of its range a start value may lie: at the end itself a smooth map has no slope and the fit cannot leave.
 MARGIN = 1e-3
@@ -73,7 +74,7 @@ class Bounded(AbstractTransform):
     def forward(self, real: Float[Array, "..."]) -> Float[Array, "..."]:
         value = self.scale * real
         # The product may be rounded out of its range; an unknown at its bound keeps its slope, so that it can leave.
-        return value + jax.lax.stop_gradient(jnp.clip(value, self.low, self.high) - value)
+        return rounded_into(value, self.low, self.high)
 
     def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.clip(value, self.low, self.high) / self.scale
@@ -189,6 +190,29 @@ class Gaps(AbstractTransform):
         return np.full(real.shape, 0.5)
 
 
+class Entrywise(AbstractTransform):
+    """A map of its own for each entry of a vector."""
+
+    parts: tuple[AbstractTransform, ...]
+
+    def forward(self, real: Float[Array, "n"]) -> Float[Array, "n"]:
+        return jnp.concatenate([part.forward(x) for part, x in self._apart(real)])
+
+    def inverse(self, value: Float[Array, "n"]) -> Float[Array, "n"]:
+        return jnp.concatenate([part.inverse(x) for part, x in self._apart(value)])
+
+    def bounds(self, real: Float[np.ndarray, "n"]) -> Bounds:
+        low, high = zip(*(part.bounds(x) for part, x in self._apart(real)), strict=True)
+        return np.concatenate(low), np.concatenate(high)
+
+    def reach(self, real: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        return np.concatenate([part.reach(x) for part, x in self._apart(real)])
+
+    def _apart(self, values: Any) -> Any:
+        """Each map with its entry, `(1,)`."""
+        return [(part, values[i : i + 1]) for i, part in enumerate(self.parts)]
+
+
 def transform_of(
     within: Range, value: Float[Array, "..."], voxel: Float[Array, ""], bounds: Interval | None
 ) -> AbstractTransform:
@@ -199,6 +223,9 @@ def transform_of(
     """
     if isinstance(within, UnitVector):
         return Direction()
+    if isinstance(within, Entries):
+        # Of one scale: an entry that is zero has none of its own.
+        return Entrywise(tuple(transform_of(interval, value, voxel, bounds) for interval in within.intervals))
     if isinstance(within, Increasing):
         scale = jnp.mean(jnp.diff(value))
         return Ordered(scale) if bounds is None else Gaps(scale)

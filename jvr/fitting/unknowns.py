@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.fitting.transforms import AbstractTransform, transform_of
-from jvr.model.ranges import NOT_NEGATIVE, Interval, Range, range_at, within
+from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range, range_at, within
 from jvr.model.scene import Scene
 from jvr.types import Scalar
 
@@ -109,7 +109,7 @@ def choose_unknowns(
 
 def _check_start(name: str, value: Array, declared: Range) -> None:
     """A start outside of its range would be moved into it, and the fit would begin from other pictures than the user's."""
-    outside = [] if not isinstance(declared, Interval) else np.asarray(value)[~declared.closed.holds(np.asarray(value))]
+    outside = [] if not isinstance(declared, Interval | Entries) else np.asarray(value)[~declared.closed.holds(np.asarray(value))]
     if np.size(outside):
         raise ValueError(
             f"{name} starts at {np.ravel(outside)[0]:g}, outside of {declared}, where a fit keeps it: start inside, or give transforms= "

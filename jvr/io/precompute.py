@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jvr.atomic import replacing
-from jvr.effects.radiance_transfer import MaterialBleeding, ProjectedTransfer
+from jvr.effects.projected_transfer import ProjectedTransfer
+from jvr.effects.radiance_transfer import MaterialBleeding
 from jvr.effects.transfer_grid import TransferProjection, finished, project_all, transfer_of
 from jvr.execution.devices import everywhere, over_rays, shares
 from jvr.model.scene import Scene

@@ -26,7 +26,7 @@ from jvr.march.compact import for_each, map_selected, write
 from jvr.march.oracle import DistanceField
 from jvr.march.sums import Sums, add, join, opacity, opaque_depth, through, transmittance
 from jvr.model.volume import Volume
-from jvr.numerics import larger, smaller
+from jvr.numerics import larger, rounded_into, smaller
 from jvr.types import Channels, Scalar, Triple
 
 # The number of a slice that no picture has.
@@ -280,7 +280,7 @@ def position(rows: Float[Array, "lanes 8"], k: Int[Array, ""], dt: Scalar, shape
     # Rays that miss are sampled for the sake of their neighbours, at the nearest point. Rays that hit are moved by a rounding, which
     # must not cost their derivative.
     bounds = [(0.0, n - 1.0) if n > 1 else (-0.5, 0.5) for n in shape]
-    return tuple(x + jax.lax.stop_gradient(jnp.clip(x, low, high) - x) for x, (low, high) in zip(p, bounds, strict=True))
+    return tuple(rounded_into(x, low, high) for x, (low, high) in zip(p, bounds, strict=True))
 
 
 def distance(rows: Float[Array, "lanes 8"], k: Array, dt: Scalar) -> Float[Array, "lanes"]:

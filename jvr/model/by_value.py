@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model.checks import float_array, require
-from jvr.model.ranges import Increasing, within
+from jvr.model.ranges import INCREASING, within
 from jvr.types import ArrayLike, Scalar
 
 Tree = TypeVar("Tree")
@@ -22,14 +22,14 @@ class ByValue(eqx.Module):
     **Raises** `ValueError` for other shapes, positions that do not increase, values that are not finite.
     """
 
-    positions: Float[Array, "n"] = eqx.field(metadata=within(Increasing()))
+    positions: Float[Array, "n"] = eqx.field(metadata=within(INCREASING))
     values: Float[Array, "n"]
 
     def __init__(self, positions: ArrayLike, values: ArrayLike):
         self.positions = float_array(positions, "positions", (None,))
         self.values = float_array(values, "values", (self.positions.shape[0],))
         require(self.values, np.isfinite, "values must be finite")
-        require(jnp.diff(self.positions), lambda d: d > 0, "positions must be strictly increasing: sort them")
+        require(self.positions, INCREASING.holds, "positions must be strictly increasing: sort them")
 
     def evaluate(self, s: Scalar) -> Scalar:
         return jnp.interp(s, self.positions, self.values)

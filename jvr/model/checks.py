@@ -7,6 +7,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jvr.model.ranges import NOT_NEGATIVE
 from jvr.types import Affine, ArrayLike
 
 # Source colours and backgrounds above this are codes that were taken for radiance; lights have their own, far larger scale, up to
@@ -53,9 +54,7 @@ def colours(value: ArrayLike | Any, name: str, *shapes: tuple[int | None, ...]) 
     **Raises** `ValueError` for whole numbers above 1 and for anything above `LARGEST_COLOUR`, with the remedy.
     """
     array = float_array(value, name, *shapes)
-    require(
-        array, lambda c: np.isfinite(c) & (c >= 0), f"{name} must be finite and not negative: it is linear RGB, and 1 is white"
-    )
+    require(array, NOT_NEGATIVE.holds, f"{name} must be finite and not negative: it is linear RGB, and 1 is white")
     values, given = known(array), None if isinstance(value, Tracer) else np.asarray(value)
     are_codes = given is not None and given.dtype.kind in "iu" and bool(np.any(given > 1))
     if values is not None and (are_codes or np.any(values > LARGEST_COLOUR)):
@@ -70,7 +69,7 @@ def radiances(value: ArrayLike | Any, name: str) -> Float[Array, "..."]:
     """`float_array` of the strength of a light, one number or `(3,)`: finite, not negative, at most `LARGEST_RADIANCE`, and not 8 or 16-bit
     codes. **Raises** `ValueError` otherwise."""
     array = float_array(value, name, (), (3,))
-    require(array, lambda c: np.isfinite(c) & (c >= 0), f"{name} must be finite and not negative")
+    require(array, NOT_NEGATIVE.holds, f"{name} must be finite and not negative")
     require(array, lambda c: c <= LARGEST_RADIANCE, f"{name} must be at most {LARGEST_RADIANCE:g}: brighter pictures overflow")
     if isinstance(value, np.ndarray) and value.dtype in (np.uint8, np.uint16):
         white = 255 if value.dtype == np.uint8 else 65535

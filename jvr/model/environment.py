@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from jvr.model import harmonics
 from jvr.model.checks import float_array, known, radiances, require
 from jvr.model.harmonics.projection import cap
+from jvr.model.ranges import NOT_NEGATIVE
 from jvr.numerics import normalise
 from jvr.pictures import as_radiance
 from jvr.types import ArrayLike
@@ -55,9 +56,7 @@ class EnvironmentLight(eqx.Module):
         height, width, _ = pixels.shape
         if width != 2 * height:
             raise ValueError(f"an environment map is twice as wide as high, not {width} x {height}: crop or resample it to 2:1")
-        require(
-            pixels, lambda p: np.isfinite(p) & (p >= 0), "an environment map must be finite and not negative: mend its pixels"
-        )
+        require(pixels, NOT_NEGATIVE.holds, "an environment map must be finite and not negative: mend its pixels")
         return cls(_windowed(harmonics.project_map(pixels, order), window), clamped=clamped)
 
     @classmethod

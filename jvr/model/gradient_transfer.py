@@ -4,12 +4,12 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import colours, float_array, require
-from jvr.model.ranges import EXTINCTION, NOT_NEGATIVE, SHARE, Increasing, within
+from jvr.model.ranges import EXTINCTION, INCREASING, NOT_NEGATIVE, SHARE, within
 from jvr.model.transfer import AbstractTransfer, Classified, any_between
+from jvr.numerics import clamp, larger, smaller
 from jvr.types import ArrayLike, Channels, Scalar
 
 
@@ -26,8 +26,8 @@ class GradientTransfer(AbstractTransfer):
 
     rgb: Float[Array, "n m 3"] = eqx.field(metadata=within(SHARE))
     sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
-    domain: Float[Array, "2"] = eqx.field(metadata=within(Increasing()))
-    magnitudes: Float[Array, "2"] = eqx.field(metadata=within(Increasing()))
+    domain: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
+    magnitudes: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
 
     def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike, magnitudes: ArrayLike):
         self.rgb = colours(rgb, "rgb", (None, None, 3))
@@ -36,11 +36,10 @@ class GradientTransfer(AbstractTransfer):
             raise ValueError(f"a GradientTransfer needs at least 2 x 2 entries, not {n} x {m}")
         self.sigma_t = float_array(sigma_t, "sigma_t", (n, m), (n, m, 3))
         require(self.sigma_t, EXTINCTION.holds, "sigma_t must be finite and not negative")
-        increasing = lambda d: np.isfinite(d) & (d[0] < d[1])
         self.domain = float_array(domain, "domain", (2,))
         self.magnitudes = float_array(magnitudes, "magnitudes", (2,))
-        require(self.domain, increasing, "domain must be (low, high) with low < high")
-        require(self.magnitudes, increasing, "magnitudes must be (low, high) with low < high")
+        require(self.domain, INCREASING.holds, "domain must be (low, high) with low < high")
+        require(self.magnitudes, INCREASING.holds, "magnitudes must be (low, high) with low < high")
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         assert magnitude is not None
@@ -79,12 +78,18 @@ class GradientOpacity(AbstractTransfer):
             raise TypeError(f"GradientOpacity scales a transfer function of the scalar, not a {type(transfer).__name__}")
         self.transfer = transfer
         self.low, self.high = float_array(low, "low", ()), float_array(high, "high", ())
-        require(jnp.stack([self.low, self.high]), lambda v: (v[0] >= 0) & (v[0] < v[1]), "GradientOpacity needs 0 <= low < high")
+        require(
+            jnp.stack([self.low, self.high]),
+            lambda v: NOT_NEGATIVE.holds(v) & (v[0] < v[1]),
+            "GradientOpacity needs 0 <= low < high",
+        )
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         assert magnitude is not None
         # Clipped before the division: far outside of a narrow range the quotient would overflow.
-        share = (jnp.clip(magnitude, self.low, self.high) - self.low) / (self.high - self.low)
+        # At `low` the derivative is that of less: where there is no gradient and `low` is 0, both can only grow.
+        clipped = smaller(larger(self.low, magnitude), self.high)
+        share = (clipped - self.low) / (self.high - self.low)
         rgb, sigma_t = self.transfer.evaluate(s)
         scaled: Channels = tuple(sigma * share for sigma in sigma_t)
         return Classified(rgb, scaled)
@@ -102,4 +107,4 @@ def _cell(x: Scalar, domain: Float[Array, "2"], n: int) -> tuple[Array, Scalar]:
 
 def _coordinate(x: Scalar, domain: Float[Array, "2"], n: int) -> Scalar:
     """Where a value falls between `n` entries, 0 ... n-1, clamped."""
-    return jnp.clip((x - domain[0]) * ((n - 1) / (domain[1] - domain[0])), 0, n - 1)
+    return clamp((x - domain[0]) * ((n - 1) / (domain[1] - domain[0])), 0, n - 1)

@@ -15,9 +15,12 @@ from jaxtyping import Array, Float
 
 from jvr.model.checks import float_array, radiances, require
 from jvr.model.exact import Exact, Remainder, in_double
-from jvr.model.ranges import DEGREES, NOT_NEGATIVE, POSITIVE, UnitVector, within
+from jvr.model.ranges import DEGREES, NOT_NEGATIVE, POSITIVE, Entries, UnitVector, within
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import ArrayLike, Scalar, Triple, Vector
+
+# Of irradiance: constant, linear and quadratic in the distance.
+ATTENUATION = Entries((POSITIVE, NOT_NEGATIVE, NOT_NEGATIVE))
 
 
 class Arrival(NamedTuple):
@@ -76,7 +79,7 @@ class PointLight(AbstractLight):
     position: Vector
     intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
     radius: Scalar = eqx.field(metadata=within(POSITIVE))
-    attenuation: Vector | None = eqx.field(metadata=within(POSITIVE))
+    attenuation: Vector | None = eqx.field(metadata=within(ATTENUATION))
     remainder: Remainder
 
     def __init__(
@@ -119,7 +122,7 @@ class SpotLight(AbstractLight):
     inner: Scalar = eqx.field(metadata=within(DEGREES))
     outer: Scalar = eqx.field(metadata=within(DEGREES))
     radius: Scalar = eqx.field(metadata=within(POSITIVE))
-    attenuation: Vector | None = eqx.field(metadata=within(POSITIVE))
+    attenuation: Vector | None = eqx.field(metadata=within(ATTENUATION))
     remainder: Remainder
 
     def __init__(
@@ -140,9 +143,7 @@ class SpotLight(AbstractLight):
         self.direction = _direction(direction, "SpotLight")
         self.inner, self.outer = float_array(inner, "inner", ()), float_array(outer, "outer", ())
         angles = jnp.stack([self.inner, self.outer])
-        require(
-            angles, lambda a: (a[0] >= 0) & (a[0] < a[1]) & (a[1] <= 180), "a SpotLight needs 0 <= inner < outer <= 180 degrees"
-        )
+        require(angles, lambda a: DEGREES.holds(a) & (a[0] < a[1]), "a SpotLight needs 0 <= inner < outer <= 180 degrees")
 
     def arrives(self, x: Triple, w_o: Triple) -> Arrival:
         towards, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
@@ -246,8 +247,9 @@ def _falloff(distance: Scalar, radius: Scalar, attenuation: Vector | None) -> Sc
 
 def _attenuation(value: ArrayLike) -> Vector:
     attenuation = float_array(value, "attenuation", (3,))
-    valid = lambda a: (a[0] > 0) & np.all(np.isfinite(a) & (a >= 0))
-    require(attenuation, valid, "attenuation is (constant, linear, quadratic), none negative and the constant positive")
+    require(
+        attenuation, ATTENUATION.holds, "attenuation is (constant, linear, quadratic), none negative and the constant positive"
+    )
     return attenuation
 
 

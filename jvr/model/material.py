@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractMaterial
 from jvr.model.harmonics.basis import basis
-from jvr.model.ranges import NOT_NEGATIVE, Increasing, within
+from jvr.model.ranges import INCREASING, NOT_NEGATIVE, within
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 # The largest angle between the normal and the eye that materials are projected for.
@@ -58,7 +58,7 @@ class HarmonicMaterial(AbstractMaterial):
 
     tinted: Lobe | None
     plain: Lobe | None
-    positions: Float[Array, "classes"] = eqx.field(metadata=within(Increasing()))
+    positions: Float[Array, "classes"] = eqx.field(metadata=within(INCREASING))
     threshold: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
 
     @classmethod
@@ -132,12 +132,12 @@ class MaterialByValue(AbstractMaterial):
     `projected` for orders or directions that differ; `TypeError` for anything else, such as another `MaterialByValue`.
     """
 
-    positions: Float[Array, "n"] = eqx.field(metadata=within(Increasing()))
+    positions: Float[Array, "n"] = eqx.field(metadata=within(INCREASING))
     materials: tuple[AbstractMaterial, ...]
 
     def __init__(self, positions: ArrayLike, materials: Sequence[AbstractMaterial]):
         self.positions = float_array(positions, "positions", (len(materials),))
-        require(jnp.diff(self.positions), lambda d: d > 0, "positions must be strictly increasing: sort them")
+        require(self.positions, INCREASING.holds, "positions must be strictly increasing: sort them")
         self.materials = tuple(materials)
         single = [
             isinstance(m, AbstractBRDF) or (isinstance(m, HarmonicMaterial) and m.positions.size == 1) for m in self.materials

@@ -61,9 +61,7 @@ class MicrofacetBRDF(AbstractBRDF):
         self.base, self.metallic = share(base, "base", (), (3,)), share(metallic, "metallic", ())
         self.reflectance_at_normal = share(reflectance_at_normal, "reflectance_at_normal", (), (3,))
         self.roughness = float_array(roughness, "roughness", ())
-        # Below, the peak of D and its derivatives leave float32; 0.001 itself may be rounded.
-        smooth = "roughness must be in [0.001, 1]; 0.001 is as good as a mirror"
-        require(self.roughness, lambda r: (r > 0.000999) & (r <= 1), smooth)
+        require(self.roughness, ROUGHNESS.holds, f"roughness must be in {ROUGHNESS}; 0.001 is as good as a mirror")
 
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
         w_o, w_i = of_one_shape(w_o, w_i)

@@ -21,8 +21,8 @@ from jvr.model.phase import (
     magnitude,
     sample_henyey_greenstein,
 )
-from jvr.model.ranges import ASYMMETRY, NOT_NEGATIVE, Interval, within
-from jvr.numerics import divide_or_zero
+from jvr.model.ranges import ASYMMETRY, INCREASING, NOT_NEGATIVE, Interval, within
+from jvr.numerics import divide_or_zero, rounded_into
 from jvr.types import ArrayLike, Channels, Scalar
 
 # Of droplets, in micrometres: what their fit was made for.
@@ -106,7 +106,7 @@ class TabulatedPhase(AbstractPhase):
         n = self.angles.shape[0]
         if n < 2:
             raise ValueError(f"a table needs at least 2 angles, not {n}")
-        require(jnp.diff(self.angles), lambda d: d > 0, "angles must be strictly increasing: sort them and remove duplicates")
+        require(self.angles, INCREASING.holds, "angles must be strictly increasing: sort them and remove duplicates")
         require(
             self.angles,
             lambda a: (abs(a[0]) < 1e-6) & (abs(a[-1] - math.pi) < 1e-5),
@@ -125,7 +125,7 @@ class TabulatedPhase(AbstractPhase):
         offset = jnp.where(angle.cos >= 0, angle.one_minus - one_minus[i], one_plus[i] - angle.one_plus)
         fraction = offset / widths[i]
         # Clamped for the rounding of the look-up alone: the derivative at an entry stays that of an interval.
-        fraction = fraction + jax.lax.stop_gradient(jnp.clip(fraction, 0.0, 1.0) - fraction)
+        fraction = rounded_into(fraction, 0.0, 1.0)
         return tuple(
             (values[i] + fraction * (values[i + 1] - values[i])) / (2.0 * math.pi * jnp.sum(masses))
             for values, masses in self._columns(widths)

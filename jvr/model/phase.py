@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model.by_value import ByValue
@@ -248,7 +247,7 @@ class Mixture(AbstractPhase):
         if m == 0:
             raise ValueError("a mixture needs at least one phase function")
         self.weights = float_array(weights, "weights", (m,), (m, 3))
-        require(self.weights, lambda w: np.isfinite(w) & (w >= 0), "weights must be finite and not negative")
+        require(self.weights, NOT_NEGATIVE.holds, "weights must be finite and not negative")
         require(
             jnp.sum(self.weights, axis=0), lambda total: total > 0, "weights must not all be zero: give one a positive weight"
         )

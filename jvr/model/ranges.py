@@ -41,8 +41,31 @@ class UnitVector:
 class Increasing:
     """Strictly increasing numbers."""
 
+    def holds(self, values: Any) -> Any:
+        """Whether the numbers are finite and each is larger than the one before."""
+        return np.all(np.isfinite(values)) & np.all(np.diff(values) > 0)
 
-Range: TypeAlias = Interval | UnitVector | Increasing
+
+@dataclasses.dataclass(frozen=True)
+class Entries:
+    """Vectors, each entry of which has an interval of its own."""
+
+    intervals: tuple[Interval, ...]
+
+    @property
+    def closed(self) -> "Entries":
+        """The same with the ends of all intervals."""
+        return Entries(tuple(interval.closed for interval in self.intervals))
+
+    def holds(self, values: Any) -> Any:
+        """Which entries are finite and in their interval."""
+        return np.stack([interval.holds(value) for interval, value in zip(self.intervals, values, strict=True)])
+
+    def __str__(self) -> str:
+        return ", ".join(map(str, self.intervals))
+
+
+Range: TypeAlias = Interval | UnitVector | Increasing | Entries
 
 ANY = Interval()
 NOT_NEGATIVE = Interval(low=0.0)
@@ -51,6 +74,7 @@ SHARE = Interval(0.0, 1.0)
 ASYMMETRY = Interval(-1.0, 1.0, is_open=True)
 EXTINCTION = Interval(low=0.0, per_length=True)
 DEGREES = Interval(0.0, 180.0)
+INCREASING = Increasing()
 
 
 def within(declared: Range) -> dict[str, Range]:

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import colours, float_array, require
-from jvr.model.ranges import EXTINCTION, POSITIVE, SHARE, Increasing, within
-from jvr.numerics import divide_or_zero, read_run
+from jvr.model.ranges import EXTINCTION, INCREASING, POSITIVE, SHARE, within
+from jvr.numerics import clamp, divide_or_zero, read_run
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 
@@ -77,7 +77,7 @@ class LinearTransfer(AbstractTable):
     **Raises** `ValueError` for other shapes, positions that do not increase, negative or non-finite values.
     """
 
-    positions: Float[Array, "n"] = eqx.field(metadata=within(Increasing()))
+    positions: Float[Array, "n"] = eqx.field(metadata=within(INCREASING))
     rgb: Float[Array, "n 3"] = eqx.field(metadata=within(SHARE))
     sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
 
@@ -87,9 +87,7 @@ class LinearTransfer(AbstractTable):
         n = self.positions.shape[0]
         if n < 2:
             raise ValueError(f"a transfer function needs at least 2 positions, not {n}")
-        require(
-            jnp.diff(self.positions), lambda d: d > 0, "positions must be strictly increasing: sort them and remove duplicates"
-        )
+        require(self.positions, INCREASING.holds, "positions must be strictly increasing: sort them and remove duplicates")
         self.rgb, self.sigma_t = _colour(rgb, n), _extinction(sigma_t, n)
 
     @property
@@ -102,7 +100,7 @@ class LinearTransfer(AbstractTable):
         i = jnp.clip(above - 1, 0, n - 2)
         low, high = self.positions[i], self.positions[i + 1]
         # Clamped before the division: far outside of a narrow interval the quotient would overflow.
-        fraction = divide_or_zero(jnp.clip(s, low, high) - low, high - low)
+        fraction = divide_or_zero(clamp(s, low, high) - low, high - low)
         return i + fraction
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
@@ -118,7 +116,7 @@ class LutTransfer(AbstractTable):
 
     rgb: Float[Array, "n 3"] = eqx.field(metadata=within(SHARE))
     sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
-    domain: Float[Array, "2"] = eqx.field(metadata=within(Increasing()))
+    domain: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
 
     def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike):
         self.rgb = colours(rgb, "rgb", (None, 3))
@@ -127,7 +125,7 @@ class LutTransfer(AbstractTable):
             raise ValueError(f"a transfer function needs at least 2 entries, not {n}")
         self.sigma_t = _extinction(sigma_t, n)
         self.domain = float_array(domain, "domain", (2,))
-        require(self.domain, lambda d: np.isfinite(d) & (d[0] < d[1]), "domain must be (low, high) with low < high")
+        require(self.domain, INCREASING.holds, "domain must be (low, high) with low < high")
 
     @property
     def positions(self) -> Float[Array, "n"]:
@@ -141,7 +139,7 @@ class LutTransfer(AbstractTable):
     def coordinate(self, s: Scalar) -> Scalar:
         last = self.rgb.shape[0] - 1
         low, high = self.domain[0], self.domain[1]
-        return jnp.clip((s - low) * (last / (high - low)), 0, last)
+        return clamp((s - low) * (last / (high - low)), 0, last)
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         return _interpolate(self, self.coordinate(s))

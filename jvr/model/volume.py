@@ -156,8 +156,8 @@ class Volume(eqx.Module):
 
     def bricked(self, size: int = 4) -> "Volume":
         """The same volume with the bounds of its bricks of `size^3` voxels, which empty-space skipping needs; without them each
-        picture computes them anew, as it does inside of `jit` where voxels are an argument (`current`). They take `2 / size^3` of the
-        voxels' memory. **Raises** `ValueError` where `size` is below 1.
+        picture computes them anew, as it does inside of your own `jit` where voxels are an argument (`current`): there close over the
+        volume. They take `2 / size^3` of the voxels' memory. **Raises** `ValueError` where `size` is below 1.
         """
         if isinstance(size, bool) or not isinstance(size, int) or size < 1:
             raise ValueError(f"the size of a brick must be a positive whole number of voxels, not {size!r}; 4 is a good start")

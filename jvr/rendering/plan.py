@@ -22,7 +22,9 @@ def _skipping(volume: Volume, settings: Settings) -> str:
     bound = f", and those of optical depth below {settings.negligible:g} a ray" if settings.negligible else ""
     if volume.bricks is None:
         return f"empty bricks{bound}; they are bounded anew for each picture: jvr.Volume.bricked() does it once"
-    return f"empty bricks of {volume.bricks.size}^3 voxels{bound}"
+    return (
+        f"empty bricks of {volume.bricks.size}^3 voxels{bound}; bounded anew inside of a jit that takes the voxels as an argument"
+    )
 
 
 def _devices() -> str:
