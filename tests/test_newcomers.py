@@ -26,6 +26,7 @@ from jvr.cli.inputs import name_of
 from jvr.io.config import build_cameras, build_scene, config_from
 from jvr.io.config.build import build_fit
 from jvr.io.config.transfers import contents
+from jvr.io.first_picture import first_picture
 from jvr.io.volumes import VolumeError
 from jvr.model.voxels import VOXEL
 
@@ -528,6 +529,23 @@ def test_small_things_are_framed_where_they_are_many():
 @pytest.mark.parametrize("hot", [1, 5])
 def test_hot_voxels_do_not_move_an_automatic_window(hot):
     np.testing.assert_allclose(contents(jvr.Volume(corner_ball(hot))), contents(jvr.Volume(corner_ball(0))), atol=0.05)
+
+
+def test_what_is_up_is_said_by_what_a_file_holds_not_by_its_name(tmp_path):
+    header = b"DimSize = 3 4 5\n%bElementType = MET_FLOAT\nElementDataFile = LOCAL\n"
+    contents_of = {
+        "a.mha": (header % b"", False),
+        "b.mha": (header % b"TransformMatrix = 1 0 0 0 1 0 0 0 1\n", True),
+        "IM0001": (bytes(128) + b"DICM", True),
+        "slices/1.png": (b"1", False),
+        "series/1": (bytes(128) + b"DICM", True),
+        "a.zarr/.zgroup": (b"{}", False),
+    }
+    for name, (content, says) in contents_of.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+        path = tmp_path / name.split("/")[0]
+        assert ("z is taken for it" in " ".join(first_picture(SCENE.volume, path, "scan").notes)) == (not says), name
 
 
 def test_pictures_are_numbered_in_the_order_of_their_names():
