@@ -34,9 +34,12 @@ def as_radiance(image: Any, name: str) -> np.ndarray:
     """The image as an array of floating-point numbers.
 
     **Raises** `ValueError` for whole numbers: they are codes of a file or a screen, of which white is 255 and the middle not half of
-    the light.
+    the light; and for what is no array of real numbers.
     """
     array = np.asarray(image)
+    if array.dtype.kind in "cOSUMm":
+        found = array.dtype if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"{name} must be an array of radiance (height, width, 3), such as the rgb of a rendering, not {found}")
     if array.dtype.kind in "biu":
         white = 65535 if array.dtype.itemsize == 2 else 255
         raise ValueError(
@@ -53,13 +56,20 @@ def srgb_from_linear(linear: ArrayLike) -> Float[np.ndarray, "..."]:
 
 
 def linear_from_srgb(code: ArrayLike) -> Float[np.ndarray, "..."]:
-    """Linear light of an sRGB code between 0 and 1 (IEC 61966-2-1)."""
-    code = np.asarray(code, np.float64)
+    """Linear light of an sRGB code between 0 and 1 (IEC 61966-2-1).
+
+    **Raises** `ValueError` for whole numbers above 1: the codes of a file are divided by the largest first, 255 or 65535.
+    """
+    given = np.asarray(code)
+    if given.dtype.kind in "iu" and given.size and given.max() > 1:
+        white = 65535 if given.max() > 255 else 255
+        raise ValueError(f"codes are whole numbers up to {given.max()}, where 1 is white: give linear_from_srgb(codes / {white})")
+    code = given.astype(np.float64)
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
 def write_image(
-    path: str | os.PathLike, image: ArrayLike, alpha: ArrayLike | None = None, *, depth: ArrayLike | None = None
+    path: str | bytes | os.PathLike, image: ArrayLike, alpha: ArrayLike | None = None, *, depth: ArrayLike | None = None
 ) -> None:
     """Writes linear radiance to `.exr` (float32, unchanged; channels A and Z for `alpha` and `depth`) or `.png` (8-bit sRGB).
 
@@ -72,14 +82,18 @@ def write_image(
     pixels that are not finite;
     `OSError` where the file cannot be written.
     """
-    path = Path(path)
+    path = Path(os.fsdecode(path))
     if path.suffix.lower() not in (".exr", ".png"):
         raise ImageError(path, f"cannot write {path.suffix or 'a name without an extension'}; use .exr (linear) or .png (sRGB)")
     pixels = np.asarray(as_radiance(image, f"{path}: the image"), np.float32)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
         raise ImageError(path, f"an image is (height, width, 3), this one {pixels.shape}")
     planes = {"alpha": alpha, "depth": depth}
-    planes = {name: np.asarray(plane, np.float32) for name, plane in planes.items() if plane is not None}
+    planes = {name: np.asarray(plane) for name, plane in planes.items() if plane is not None}
+    if alpha is not None and (planes["alpha"].dtype.kind in "iu" or np.max(planes["alpha"], initial=0) > 1.001):
+        largest = planes["alpha"].max()
+        raise ImageError(path, f"alpha goes up to {largest}, but 1 is opaque: give floating-point numbers from 0 to 1")
+    planes = {name: plane.astype(np.float32) for name, plane in planes.items()}
     for name, plane in planes.items():
         if plane.shape != pixels.shape[:2]:
             raise ImageError(
@@ -105,6 +119,10 @@ def _png(path: Path, pixels: Pixels, alpha: Plane | None) -> bytes:
     bad = ~np.isfinite(pixels).all(axis=-1) | (False if alpha is None else ~np.isfinite(alpha))
     if bad.any():
         raise ImageError(path, f"{int(bad.sum()):,} pixels are not finite, which a PNG cannot hold; write .exr, or repair them")
+    # A photograph that was only converted to floating point would be white.
+    if pixels.max() >= 16 and np.array_equal(pixels, np.rint(pixels)):
+        problem = f"its pixels are whole numbers up to {pixels.max():g}, where 1 is white"
+        raise ImageError(path, f"{problem}: convert codes by jvr.linear_from_srgb(codes / 255)")
     if alpha is None:
         return png_bytes(_codes(srgb_from_linear(pixels)))
     divisor = np.where(alpha > 0, alpha, 1)[..., None].astype(np.float64)

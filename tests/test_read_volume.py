@@ -624,8 +624,8 @@ def test_paths_that_hold_nothing(tmp_path):
     fails("the file is empty", tmp_path / "head.nii.gz")
     fails("did you mean 'head.nii.gz'", tmp_path / "haed.nii.gz", error=FileNotFoundError)
     fails("no such file$", tmp_path / "nowhere" / "a.nii", error=FileNotFoundError)
-    (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff")
-    fails(r"unsupported extension '.jpg'; supported: .mhd, .*\.zarr", tmp_path / "a.jpg")
+    (tmp_path / "a.doc").write_bytes(b"\xff\xd8\xff")
+    fails(r"unsupported extension '.doc'; supported: .mhd, .*\.zarr", tmp_path / "a.doc")
     fails("no DICOM series", tmp_path)
 
 

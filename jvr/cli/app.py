@@ -35,6 +35,13 @@ Spacing = Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Millimetres 
 Origin = Annotated[
     str | None, typer.Option(metavar="X,Y,Z", help="Position of the first voxel in millimetres, in place of the file's.")
 ]
+Direction = Annotated[
+    str | None, typer.Option(metavar="NUMBERS", help="Nine numbers: x, y, z of each of the grid's axes, in place of the file's.")
+]
+Slope = Annotated[float | None, typer.Option(help="Data units for one stored, in place of the file's.")]
+Intercept = Annotated[float | None, typer.Option(help="Data units where 0 is stored, in place of the file's.")]
+Array = Annotated[str | None, typer.Option("--array", help="Which array of a .vtk, .vti or .zarr, or image of a .tif.")]
+Series = Annotated[str | None, typer.Option(help="Which series of a DICOM folder.")]
 Axes = Annotated[str | None, typer.Option(help="Names of the axes of a .npy, .tif or .zarr, such as zyx or tczyx.")]
 Channel = Annotated[str | None, typer.Option(help="Which of several channels: its index from 0, or its name.")]
 Time = Annotated[int | None, typer.Option("--time", min=0, help="Which of several points in time: its index from 0.")]
@@ -106,6 +113,11 @@ def render(
     dtype: Dtype = None,
     spacing: Spacing = None,
     origin: Origin = None,
+    direction: Direction = None,
+    slope: Slope = None,
+    intercept: Intercept = None,
+    array: Array = None,
+    series: Series = None,
     axes: Axes = None,
     channel: Channel = None,
     time: Time = None,
@@ -120,9 +132,15 @@ def render(
     with reading():
         output = Path(f"{name_of(given)}.png") if output is None else output
         check_image_output(output)
-        keywords = _given(
-            shape, spacing, origin, dtype=dtype, axes=axes, channel=channel, time=time, missing=missing, nan_value=nan_value
-        )
+        choice = {"array": array, "series": series, "axes": axes, "channel": channel, "time": time}
+        scaled = {
+            "direction": _matrix(direction),
+            "slope": slope,
+            "intercept": intercept,
+            "missing": missing,
+            "nan_value": nan_value,
+        }
+        keywords = _given(shape, spacing, origin, dtype=dtype, **choice, **scaled)
         wishes = Wishes(preset, view, _triple(up, "--up", float, positive=False), background, orbit, lit)
         config, volume, notes = configured(given, sets or [], keywords, wishes)
         config = _sized(config, size)
@@ -239,13 +257,16 @@ def info(
     dtype: Dtype = None,
     spacing: Spacing = None,
     origin: Origin = None,
+    direction: Direction = None,
+    slope: Slope = None,
+    intercept: Intercept = None,
+    array: Array = None,
+    series: Series = None,
     axes: Axes = None,
     channel: Channel = None,
     time: Time = None,
     missing: Missing = None,
     nan_value: NanValue = None,
-    array: Annotated[str | None, typer.Option(help="Which array of a .vtk, .vti or .zarr, or image of a .tif.")] = None,
-    series: Annotated[str | None, typer.Option(help="Which series of a DICOM folder.")] = None,
     as_json: Json = False,
 ) -> None:
     """Say what a volume holds: shape, type, place in the world, values."""
@@ -254,7 +275,14 @@ def info(
         from jvr.io.volumes import read_volume
 
         choice = {"array": array, "series": series, "axes": axes, "channel": channel, "time": time}
-        keywords = _given(shape, spacing, origin, dtype=dtype, missing=missing, nan_value=nan_value, **choice)
+        scaled = {
+            "direction": _matrix(direction),
+            "slope": slope,
+            "intercept": intercept,
+            "missing": missing,
+            "nan_value": nan_value,
+        }
+        keywords = _given(shape, spacing, origin, dtype=dtype, **choice, **scaled)
         found = describe(read_volume(volume, **keywords), volume)
     _print(found, as_json, format_description(found))
 
@@ -297,13 +325,28 @@ def _triple(text: str | None, flag: str, kind: type, *, positive: bool = True) -
         return None
     try:
         numbers = [kind(part) for part in text.replace("x", ",").split(",")]
+        # One distance stands for all three.
+        numbers = 3 * numbers if flag == "--spacing" and len(numbers) == 1 else numbers
     except ValueError:
         numbers = []
     if len(numbers) != 3 or (positive and min(numbers) <= 0):
         what = "whole numbers of voxels" if kind is int else "numbers of millimetres"
-        example = "256,256,128" if positive else "-120,-120,40.5"
+        example = "-120,-120,40.5" if not positive else "256,256,128" if kind is int else "0.5,0.5,2"
         raise BadInput(f"{flag} {text}: must be three {'positive ' if positive else ''}{what} along x, y, z, such as {example}")
     return numbers
+
+
+def _matrix(text: str | None) -> list[list[float]] | None:
+    """Nine numbers, axis by axis, as a matrix with the axes in its columns."""
+    if text is None:
+        return None
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 9:
+        raise BadInput(f"--direction {text}: must be nine numbers, the directions of x, y and z, such as 1,0,0,0,1,0,0,0,1")
+    return [numbers[k::3] for k in range(3)]
 
 
 def _sized(config: Any, size: int | None) -> Any:

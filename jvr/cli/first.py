@@ -1,6 +1,7 @@
 """`jvr render` of a volume file: a configuration made for what the file holds."""
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,10 @@ def configured(given: Path, sets: list[str], keywords: dict[str, Any], wishes: W
     from jvr.io.first_picture import first_picture
 
     start_jax()
-    volume = build_volume(load(given, [text for text in sets if text.startswith("volume.")], keywords))
+    of_volume = [text for text in sets if re.match(r"\s*volume\s*[.=]", text)]
+    if whole := next((text for text in of_volume if re.match(r"\s*volume\s*=", text)), None):
+        raise BadInput(f"--set {whole}: set the keys of the volume one by one, such as volume.spacing=[1,1,2]")
+    volume = build_volume(load(given, of_volume, keywords))
     tables, notes = first_picture(volume, given, wishes.preset, lit=wishes.lit is not False)
     tables["volume"] = {"path": str(given.absolute()), **keywords, **tables.get("volume", {})}
     tables["background"] = [0.0, 0.0, 0.0] if wishes.background is None else _colour(wishes.background)
@@ -58,7 +62,7 @@ def _camera(wishes: Wishes, guessed: dict[str, Any]) -> dict[str, Any]:
 
 def _colour(text: str) -> list[float]:
     """A background as linear radiance: a name, `#rrggbb`, or three numbers that are linear already."""
-    from matplotlib.colors import to_rgb
+    from matplotlib.colors import to_rgba
 
     from jvr.pictures import linear_from_srgb
 
@@ -66,7 +70,11 @@ def _colour(text: str) -> list[float]:
         if "," in text:
             red, green, blue = (float(part) for part in text.split(","))
             return [red, green, blue]
-        return [float(c) for c in linear_from_srgb(to_rgb(text))]
+        *colour, alpha = to_rgba(text)
+        # A single number would be a grey code, and "none" black.
+        if alpha < 1 or re.fullmatch(r"[\d.\s]+", text):
+            raise ValueError
+        return [float(c) for c in linear_from_srgb(colour)]
     except ValueError:
         example = "white, #20242c, or three numbers of linear radiance such as 0.1,0.1,0.2"
         raise BadInput(f"--background {text}: must be a colour such as {example}") from None

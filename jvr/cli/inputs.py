@@ -81,7 +81,8 @@ def name_of(given: Path) -> str:
     """A volume's or configuration's name without its ending; dots of its own stay: `scan.v2.nii.gz` is `scan.v2`."""
     from jvr.io.volumes import READERS
 
-    name = given.resolve().name or "volume"
+    # Not what a link leads to: stores of data call that by its checksum.
+    name = Path(os.path.abspath(given)).name or "volume"
     if given.is_dir() and not name.lower().endswith(".zarr"):
         return name
     endings = [ending for ending in (*READERS, ".toml") if name.lower().endswith(ending)]

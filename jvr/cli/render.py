@@ -1,6 +1,8 @@
 """`jvr render`."""
 
+import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,11 @@ from jvr.io.animation import write_animation
 from jvr.io.config import Config, build_cameras, build_scene, build_settings
 from jvr.io.config.schema.transfer import PresetTable
 from jvr.io.first_picture import what_is_seen
+from jvr.io.volumes.errors import available_memory
 from jvr.model.volume import Volume
 
+# Of a pixel: colour, opacity, depth and steps, and a copy of each.
+BYTES = 48
 # Seconds that an animation takes to go round.
 TURN = 6.0
 
@@ -30,6 +35,7 @@ def render_pictures(config: Config, output: Path, volume: Volume | None = None, 
         cameras = build_cameras(config, scene.volume, scene.transfer)
         if isinstance(config.tables.transfer, PresetTable) and (note := what_is_seen(scene.volume, scene.transfer)):
             explain(f"note: {note}", 0)
+        _check_memory(cameras)
         outputs, inputs = _names(output, len(cameras)), inputs_of(config)
         moving = output.with_suffix(".gif") if animated else None
         for path in [*outputs, *([moving] if moving else [])]:
@@ -73,6 +79,14 @@ def render_pictures(config: Config, output: Path, volume: Volume | None = None, 
     }
 
 
+def _check_memory(cameras: Sequence[Any]) -> None:
+    """Refuses pictures that the memory cannot take, before hours are spent on them."""
+    width, height = max(((camera.width, camera.height) for camera in cameras), key=math.prod)
+    needed, free = width * height * BYTES, available_memory()
+    if free is not None and needed > free:
+        raise BadInput(f"{width} x {height} pixels need {needed:,} bytes, {free:,} are free in memory: choose a smaller --size")
+
+
 def _rendered(render: Any, *arguments: Any) -> Any:
     """A picture. What renders no scene of this kind says so while it is compiled."""
     try:
@@ -86,7 +100,8 @@ def _rendered(render: Any, *arguments: Any) -> Any:
 def _names(output: Path, count: int) -> list[Path]:
     if count == 1:
         return [output]
-    return [output.with_name(f"{output.stem}_{i:02d}{output.suffix}") for i in range(count)]
+    digits = max(2, len(str(count - 1)))
+    return [output.with_name(f"{output.stem}_{i:0{digits}d}{output.suffix}") for i in range(count)]
 
 
 def _numbers(picture: Any, camera: Any, path: Path, seconds: float) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Target images as one long list of rays with their target colours, and samples kept along them."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -98,12 +99,16 @@ def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "ta
 
     **Raises** `ValueError` where their number or a size differs, a pixel is not finite, or they hold codes in place of radiance.
     """
+    if isinstance(cameras, AbstractCamera) or getattr(images, "ndim", 4) == 3:
+        raise TypeError("cameras and images must be sequences of as many: put a single one in brackets, as [camera] and [image]")
     images = [as_radiance(image, f"{name} {i}").astype(jnp.result_type(float)) for i, image in enumerate(images)]
     if len(images) != len(cameras) or not images:
         raise ValueError(
             f"there are {len(images)} images for {len(cameras)} cameras: give one image for each camera, and at least one"
         )
     for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        if image.shape == (camera.height, camera.width, 4):
+            raise ValueError(f"{name} {i} has four channels: give light over the scene's background, (height, width, 3)")
         if image.shape != (camera.height, camera.width, 3):
             raise ValueError(
                 f"{name} {i} has shape {image.shape}, its camera sees {(camera.height, camera.width, 3)}: resize the image or the camera"
@@ -118,6 +123,12 @@ def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "ta
                 f"{name} {i} holds whole numbers up to {image.max():g}, radiance has white at 1: "
                 "convert codes by jvr.linear_from_srgb(codes / 255)"
             )
+        if image.max() >= 16 and np.mean(image > 1) > 0.5:
+            warnings.warn(
+                f"{name} {i} goes up to {image.max():g} and is mostly brighter than white, 1: are these codes?", stacklevel=3
+            )
+        if count := np.count_nonzero(image < 0):
+            warnings.warn(f"{name} {i} has {count:,} negative values, which no scene gives: is it a difference?", stacklevel=3)
     return images
 
 

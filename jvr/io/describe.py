@@ -20,7 +20,8 @@ def describe(volume: Volume, path: str | os.PathLike | None = None) -> dict[str,
     """Shape, type, place in the world and distribution of values of a volume, as plain numbers, strings and lists.
 
     Lengths are millimetres; values are in data units (slope and intercept applied) and of voxels that hold data only, the
-    others are counted in `missing`. `orientation` names where the axes i, j, k of the grid point, in LPS: "LPS" is the
+    others are counted in `missing`, and `missing_value` is the number in the file
+    that means so, `None` where that is NaN. `orientation` names where the axes i, j, k of the grid point, in LPS: "LPS" is the
     identity, "RAS" points to the right, anterior and superior; `oblique_degrees` is the largest angle between an axis of the
     grid and the axis of the world that names it. `histogram` has 32 equal bins between the smallest and the largest value
     (`counts`) and their 33 `edges`. Percentiles of more than 2^24 voxels are those of an even subset. `mean`, `minimum`,
@@ -47,6 +48,7 @@ def describe(volume: Volume, path: str | os.PathLike | None = None) -> dict[str,
         "intercept": float(volume.intercept),
         "unit": volume.unit,
         "missing": int(values.size - _data(volume).size),
+        "missing_value": _missing_value(volume),
         **_distribution(_data(volume), float(volume.slope), float(volume.intercept)),
     }
 
@@ -59,6 +61,11 @@ def orientation(world_from_grid: np.ndarray) -> tuple[str, float]:
     along = [directions[axes[i], i] for i in range(3)]
     letters = "".join(("LR", "PA", "SI")[axis][int(d < 0)] for axis, d in zip(axes, along, strict=True))
     return letters, float(np.degrees(np.arccos(np.clip(np.abs(along).min(), 0, 1))))
+
+
+def _missing_value(volume: Volume) -> float | None:
+    """The number of missing voxels, in data units."""
+    return None if volume.missing is None else float(f"{float(volume.slope) * volume.missing + float(volume.intercept):.7g}")
 
 
 def _rounded(numbers: np.ndarray) -> list[float]:
@@ -120,13 +127,18 @@ def format_description(description: dict[str, Any]) -> str:
         ("origin", f"{triple('origin', ', ')} mm"),
         ("orientation", f"{d['orientation']} (i, j, k to {towards}){tilted}"),
         *([("rescaling", f"{d['slope']:g} * voxel + {d['intercept']:g}")] if (d["slope"], d["intercept"]) != (1, 0) else []),
-        *([("missing", f"{d['missing']:,} voxels ({100 * d['missing'] / np.prod(d['shape']):.3g} %)")] if d["missing"] else []),
+        *([("missing", _missing(d))] if d["missing"] else []),
     ]
     if d["mean"] is not None:
         rows.append(("values", f"{d['minimum']:g} ... {d['maximum']:g} {d['unit']}".rstrip() + f", mean {d['mean']:g}"))
         rows.append(("percentiles", "   ".join(f"{p} %: {value:g}" for p, value in d["percentiles"].items())))
     lines = [f"{name:<13}{text}" for name, text in rows]
     return "\n".join(lines + _chart(d["histogram"]))
+
+
+def _missing(d: dict[str, Any]) -> str:
+    value = "NaN" if d["missing_value"] is None else f"{d['missing_value']:g}"
+    return f"{d['missing']:,} voxels ({100 * d['missing'] / np.prod(d['shape']):.3g} %), which are {value}"
 
 
 def _size(count: int) -> str:

@@ -3,6 +3,7 @@
 What is guessed is said in a line each: `FirstPicture.notes`.
 """
 
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,12 +14,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.io.config.transfers import LABEL_DEPTH, contents
+from jvr.io.volumes.dicom import looks_like_dicom
+from jvr.io.volumes.errors import first_bytes
+from jvr.io.volumes.slices import is_slices
+from jvr.io.volumes.zarr_files import is_zarr
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
 from jvr.model.voxels import typical_range
 
 # Formats that say how a patient lies; others say nothing of what is up.
-ORIENTED = (".nii", ".nii.gz", ".dcm", ".nrrd", ".nhdr", ".mha", ".mhd")
+ORIENTED = (".nii", ".nii.gz", ".hdr", ".img", ".dcm", ".nrrd", ".nhdr")
 SUBSET = 1 << 20
 # Labels: so few different whole numbers, and so many neighbours that are equal.
 MOST_LABELS, EQUAL = 256, 0.8
@@ -52,9 +57,21 @@ def first_picture(volume: Volume, path: Path, preset: str | None = None, *, lit:
         tables["volume"] = {"interpolation": "nearest"}
     if lit:
         tables |= {"lights": LIGHTS, "shading": {**SHADING, "threshold": _surface(volume, kind)}}
-    if not path.is_dir() and not path.name.lower().endswith(ORIENTED):
+    if not _says_what_is_up(path):
         notes.append("the file does not say what is up: z is taken for it (--up and --view say otherwise)")
     return FirstPicture(tables, notes)
+
+
+def _says_what_is_up(path: Path) -> bool:
+    """Whether a file or folder says how a patient lies."""
+    if path.is_dir():
+        return not (is_zarr(path) or is_slices(path))
+    start = first_bytes(path, 4096) if path.is_file() else b""
+    if path.name.lower().endswith((".mha", ".mhd")):
+        return (
+            re.search(rb"^\s*(TransformMatrix|Rotation|Orientation|AnatomicalOrientation)\s*=", start, re.MULTILINE) is not None
+        )
+    return path.name.lower().endswith(ORIENTED) or looks_like_dicom(start)
 
 
 @eqx.filter_jit

@@ -11,7 +11,9 @@ from jaxtyping import Float, Float32
 
 from jvr.io.image_sizes import check_exr, check_pixels, check_radiance, sixteen_bits
 from jvr.io.volumes.errors import SIGNATURES, first_bytes, one_line
-from jvr.pictures import ImageError, Pixels, linear_from_srgb, quiet
+from jvr.model.checks import colours
+from jvr.pictures import ImageError, Pixels, Plane, linear_from_srgb, quiet
+from jvr.types import ArrayLike
 
 EXR, HDR, PNG, JPEG = b"\x76\x2f\x31\x01", b"#?", b"\x89PNG", b"\xff\xd8\xff"
 KINDS = {
@@ -23,20 +25,23 @@ KINDS = {
 KINDS[".jpeg"] = KINDS[".jpg"]
 
 
-def read_image(path: str | os.PathLike) -> Pixels:
+def read_image(path: str | bytes | os.PathLike, *, background: ArrayLike | None = None) -> Pixels:
     """Linear radiance of an image file, row 0 at the top.
 
+    `background`, `(3,)` linear RGB, is what shows through where a file has an alpha below 1; without one that is black, with a warning
+    where the colours of the file are not over black already.
+
     - `.exr`: channels R, G, B, or Y alone (grey); half, float or integer; of a tiled file with several resolutions the finest.
-      An alpha plays no part: EXR's colours are light over black already. A cropped file is placed on black where its display
-      window says.
+      EXR's colours are light over black already, to which its alpha adds the background. A cropped file is placed on black where its
+      display window says.
     - `.hdr`: Radiance, 8 bits per channel and a common exponent; divided by the exposure that its header states.
     - `.png`, `.jpg`: 8 or 16 bits, taken as sRGB, with a warning where the file says otherwise; turned as its EXIF says; with an
-      alpha the colours are multiplied by it, so that the result is light over black too.
+      alpha the colours are multiplied by it, which makes them light over black too.
 
     **Raises** `FileNotFoundError`, or `ImageError` (a `ValueError`) for a file that is empty, damaged, cut short, of another kind
     than its name says, or without colour channels.
     """
-    path = Path(path)
+    path = Path(os.fsdecode(path))
     if path.suffix.lower() not in KINDS:
         raise ImageError(path, f"cannot read {path.suffix or 'a name without an extension'}; images are .exr, .hdr, .png or .jpg")
     if path.is_dir():
@@ -47,8 +52,22 @@ def read_image(path: str | os.PathLike) -> Pixels:
     magic, kind = KINDS[path.suffix.lower()]
     if not start.startswith(magic):
         raise ImageError(path, f"this is not {kind}, the content looks like {_kind(start)}; give the file its right extension")
-    reader = {EXR: _read_exr, HDR: _read_radiance}.get(magic)
-    return _read_srgb(path, start) if reader is None else reader(path)
+    behind = None if background is None else np.asarray(colours(background, "background", (3,)))
+    if magic == HDR:
+        return _read_radiance(path)
+    pixels, alpha = _read_exr(path) if magic == EXR else _read_srgb(path, start)
+    through = None if alpha is None else np.clip(1 - alpha, 0, 1)
+    if through is None or not through.any():
+        return pixels
+    if behind is not None:
+        return (pixels + through[..., None] * behind).astype(np.float32)
+    if magic != EXR:
+        count = np.count_nonzero(through)
+        warnings.warn(
+            f"{path}: {count:,} pixels are transparent and read as light over black: background= puts them over a colour",
+            stacklevel=2,
+        )
+    return pixels
 
 
 def _kind(start: bytes) -> str:
@@ -60,7 +79,7 @@ def _kind(start: bytes) -> str:
 # --- OpenEXR ---------------------------------------------------------------------------------------------------------
 
 
-def _read_exr(path: Path) -> Pixels:
+def _read_exr(path: Path) -> tuple[Pixels, Plane | None]:
     check_exr(path)
     with quiet():
         import OpenEXR
@@ -69,7 +88,8 @@ def _read_exr(path: Path) -> Pixels:
             header = OpenEXR.File(str(path), header_only=True).header()
         except Exception as error:
             raise ImageError(path, f"the OpenEXR header is damaged or cut short ({one_line(error)}); export it again") from error
-    wanted = _colour_channels(path, header)
+    colour = _colour_channels(path, header)
+    wanted = (*colour, *("A" for channel in header["channels"] if channel.name == "A"))
     low, high = _window(header["dataWindow"])
     with quiet():
         # OpenEXR says only on the terminal that pixels are missing, and then returns a file without parts.
@@ -80,8 +100,12 @@ def _read_exr(path: Path) -> Pixels:
             raise ImageError(path, "the pixels are damaged or cut short; copy or export the file again") from error
     if any(plane.shape != tuple((high - low)[::-1]) for plane in planes):
         raise ImageError(path, f"channels {', '.join(wanted)} do not have the full resolution; save them without subsampling")
-    pixels = np.stack([plane.astype(np.float32) for plane in planes] * (3 // len(planes)), axis=-1)
-    return _framed(pixels, low, *_window(header["displayWindow"]))
+    if any(not np.issubdtype(plane.dtype, np.floating) for plane in planes[len(colour) :]):
+        wanted, planes = colour, planes[: len(colour)]
+    pixels = np.stack([plane.astype(np.float32) for plane in planes], axis=-1)
+    framed = _framed(pixels, low, *_window(header["displayWindow"]))
+    picture = np.broadcast_to(framed[..., : len(colour)], (*framed.shape[:2], 3))
+    return np.ascontiguousarray(picture), None if len(wanted) == len(colour) else framed[..., -1]
 
 
 def _colour_channels(path: Path, header: dict[str, Any]) -> tuple[str, ...]:
@@ -100,12 +124,14 @@ def _window(window: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(window[0], np.int64), np.asarray(window[1], np.int64) + 1
 
 
-def _framed(pixels: Pixels, corner: np.ndarray, low: np.ndarray, high: np.ndarray) -> Float32[np.ndarray, "rows columns 3"]:
+def _framed(
+    pixels: Float32[np.ndarray, "height width channels"], corner: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> Float32[np.ndarray, "rows columns channels"]:
     """Pixels whose first is at `corner` = (column, row), seen in the window from `low` to `high`; black where there are none."""
     end = corner + pixels.shape[1::-1]
     if np.array_equal(corner, low) and np.array_equal(end, high):
         return pixels
-    framed = np.zeros((*(high - low)[::-1], 3), np.float32)
+    framed = np.zeros((*(high - low)[::-1], pixels.shape[2]), np.float32)
     first, last = np.maximum(corner, low), np.minimum(end, high)
     if np.all(first < last):
         part = lambda origin: tuple(slice(a, b) for a, b in zip((first - origin)[::-1], (last - origin)[::-1], strict=True))
@@ -142,7 +168,7 @@ def _read_radiance(path: Path) -> Pixels:
 # --- PNG, JPEG -------------------------------------------------------------------------------------------------------
 
 
-def _read_srgb(path: Path, start: bytes) -> Pixels:
+def _read_srgb(path: Path, start: bytes) -> tuple[Pixels, Plane | None]:
     if start.startswith(PNG):
         bits = start[24] * {2: 3, 4: 2, 6: 4}.get(start[25], 1) if len(start) > 25 else 0
         width, height = (int.from_bytes(start[k : k + 4], "big") for k in (16, 20))
@@ -159,7 +185,8 @@ def _read_srgb(path: Path, start: bytes) -> Pixels:
     has_alpha = code.shape[2] in (2, 4)
     colour = linear_from_srgb(code[..., :-1] if has_alpha else code)
     pixels = colour * code[..., -1:] if has_alpha else colour
-    return np.broadcast_to(pixels, (*pixels.shape[:2], 3)).astype(np.float32)
+    picture = np.broadcast_to(pixels, (*pixels.shape[:2], 3)).astype(np.float32)
+    return picture, code[..., -1].astype(np.float32) if has_alpha else None
 
 
 def _eight_bits(path: Path) -> Float[np.ndarray, "..."]:

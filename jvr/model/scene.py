@@ -86,6 +86,7 @@ class Scene(eqx.Module):
         self.environment = environment
         self.material = material
         self.radiance_transfer = radiance_transfer
+        _check_kinds(self)
         _check_light(self)
         _check_environment(self)
 
@@ -112,9 +113,13 @@ def material_order(environment: EnvironmentLight, transfer: AbstractRadianceTran
     return max(environment.order, transfer.order)
 
 
-def _check_light(scene: Scene) -> None:
-    """Parts of the light that go together, each of its kind."""
+def _check_kinds(scene: Scene) -> None:
+    """Every part is of its kind."""
     kinds = {
+        "volume": Volume,
+        "transfer": AbstractTransfer,
+        "optical": AbstractOpticalModel,
+        "clipping": ClippingBox,
         "shading": AbstractShading,
         "shadows": AbstractShadows,
         "scattering": AbstractScattering,
@@ -125,11 +130,17 @@ def _check_light(scene: Scene) -> None:
     }
     for name, kind in kinds.items():
         part = getattr(scene, name)
-        if part is not None and not isinstance(part, kind):
-            raise TypeError(f"{name} must be one of jvr's, not {type(part).__name__}")
+        absent = part is None and name not in ("volume", "transfer", "optical")
+        if not absent and not isinstance(part, kind):
+            wanted = "a jvr.Volume, as jvr.read_volume gives it" if name == "volume" else "one of jvr's"
+            raise TypeError(f"{name} must be {wanted}, not {type(part).__name__}")
     for light in scene.lights:
         if not isinstance(light, AbstractLight | AmbientLight):
             raise TypeError(f"lights must be a sequence of jvr's lights, not of {type(light).__name__}")
+
+
+def _check_light(scene: Scene) -> None:
+    """Parts of the light that go together."""
     if scene.shadows is not None and not any(isinstance(light, AbstractLight) and light.casts_shadows for light in scene.lights):
         raise ValueError(
             "there are shadows and no light that casts them: add a jvr.DirectionalLight to lights=, or leave shadows out"

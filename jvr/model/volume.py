@@ -1,6 +1,7 @@
 """The scalar volume: voxels, where they lie in the world, and how values between them are defined."""
 
 import abc
+import dataclasses
 import functools
 from typing import ClassVar, NamedTuple
 
@@ -17,7 +18,7 @@ from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder
 from jvr.model.kept import is_made_of, note_sources
 from jvr.model.packing import Squares, squares_of
-from jvr.model.voxels import CELL, VOXEL, in_memory, typical_range, without_gaps
+from jvr.model.voxels import CELL, VOXEL, as_missing, in_memory, masked_voxels, typical_range, without_gaps
 from jvr.numerics import add_runs, read_at, read_run, transformed, turned
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
 
@@ -94,6 +95,11 @@ class Volume(eqx.Module):
     - `remainder`: of a `world_from_grid` that JAX holds already: what single precision leaves of one that was given in double precision
       (see `jvr.model.exact`). Positions of cameras, lights and clipping boxes are taken relative to the volume before they are rounded.
 
+    - `gaps`: which voxels are missing beside those, as another volume has them: non-zero, or odd, where one is.
+
+    A masked array of NumPy has its masked voxels missing.
+    `dataclasses.replace(volume, slope=2.0)` makes a volume that differs in that, as `equinox.tree_at` does.
+
     `bricks`, `squares` and `gradients` are `None` until `bricked()`, `packed()` and `graded()` make them. What has been replaced since is
     never seen in their place: `current()` makes them anew where they are not known to belong to the voxels. `gaps` says which voxels are
     missing (bit 0; bit 1: which cells of eight have one that is), `None` where none is; voxels that are replaced keep it.
@@ -108,12 +114,13 @@ class Volume(eqx.Module):
     slope: Scalar
     intercept: Scalar
     interpolation: AbstractInterpolation
-    bricks: Bricks | None
-    squares: Squares | None
-    gradients: Float[Array, "x y z 3"] | None
+    bricks: Bricks | None = eqx.field(init=False)
+    squares: Squares | None = eqx.field(init=False)
+    gradients: Float[Array, "x y z 3"] | None = eqx.field(init=False)
     gaps: UInt8[Array, "x y z"] | None
     remainder: Remainder
     unit: str = eqx.field(static=True)
+    missing: float | int | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -126,17 +133,24 @@ class Volume(eqx.Module):
         missing: float | int | None = None,
         unit: str = "",
         remainder: Remainder | None = None,
+        gaps: ArrayLike | None = None,
     ):
+        masked, missing = masked_voxels(values), as_missing(missing)
+        if not isinstance(interpolation, AbstractInterpolation):
+            raise TypeError(f"interpolation must be jvr.Trilinear() or jvr.Nearest(), not {interpolation!r}")
         values = in_memory(values)
         if values.ndim != 3 or values.size == 0:
-            raise ValueError(f"a volume needs three non-empty axes (x, y, z); its voxels have shape {values.shape}")
+            thick = (
+                ": give values[:, :, None]" if values.ndim == 2 else ": choose one of the last axis" if values.ndim > 3 else ""
+            )
+            raise ValueError(f"a volume needs three non-empty axes (x, y, z); its voxels have shape {values.shape}{thick}")
         if values.size >= 2**31:
             raise ValueError(
                 f"{values.shape} is {values.size:,} voxels; 2^31 voxels and more do not fit 32-bit indices: crop or coarsen"
             )
         if not (jnp.issubdtype(values.dtype, jnp.floating) or jnp.issubdtype(values.dtype, jnp.integer)):
             raise TypeError(f"voxels must be real or integer numbers, not {values.dtype}")
-        self.values, self.gaps = jax.tree.map(spread, without_gaps(values, missing))
+        self.values, self.gaps = jax.tree.map(spread, without_gaps(values, missing, masked, gaps))
         if jnp.issubdtype(values.dtype, jnp.floating):
             require(
                 self.values, lambda v: ~np.isinf(v), "voxels must not be infinite: replace them, by NaN where there are no data"
@@ -150,6 +164,8 @@ class Volume(eqx.Module):
         require(self.intercept, np.isfinite, f"intercept must be finite, not {intercept}")
         self.interpolation = interpolation
         self.unit = unit
+        # Without gaps it says nothing, and would be a reason to compile anew.
+        self.missing = None if self.gaps is None else missing
         self.bricks = None
         self.squares = None
         self.gradients = None
@@ -370,7 +386,10 @@ def _quantised(volume: Volume) -> Volume:
     scale = jnp.where(high > low, (high - low) / 255, 1.0)
     levels = jnp.clip(jnp.round((values - low) / scale), 0, 255).astype(jnp.uint8)
     slope, intercept = volume.slope * scale, volume.slope * low + volume.intercept
-    return eqx.tree_at(lambda v: (v.values, v.slope, v.intercept), volume, (levels, slope, intercept))
+    # A level that happens to be the number of missing voxels is none of them.
+    quantised = dataclasses.replace(volume, values=levels, slope=slope, intercept=intercept, missing=None)
+    kept = lambda v: (v.bricks, v.gradients)
+    return eqx.tree_at(kept, quantised, kept(volume), is_leaf=lambda x: x is None)
 
 
 class ClippingBox(eqx.Module):

@@ -1,11 +1,14 @@
 """Voxels as a volume keeps them in memory: their type, those that are missing, and the range of the others."""
 
+import os
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Num, Shaped, UInt8
 
 from jvr.model.checks import known
@@ -25,21 +28,63 @@ def in_memory(values: Any) -> Shaped[Array, "..."]:
     """An array that JAX holds, of what NumPy holds: whatever its byte order, truth values as 0 and 1, integers of 64 bits as narrow as they
     fit, floats of 64 bits as JAX's own (with a warning where that takes what sets them apart).
 
-    **Raises** `TypeError` for what is no real number, `ValueError` for integers that fit no type and floats that become infinite.
+    **Raises** `TypeError` for what is no real number, or has names for its axes, `ValueError` for integers that fit no type and for floats
+    that become infinite.
     """
     if isinstance(values, Array):
         return values.astype(jnp.uint8) if values.dtype == bool else values
-    values = np.asarray(values)
+    values = _array(values)
     if values.dtype.kind == "b":
         return jnp.asarray(values.astype(np.uint8))
-    if values.dtype.kind not in "iuf":
-        raise TypeError(f"voxels must be real or integer numbers, not {values.dtype}")
     if values.dtype.kind == "f" and values.dtype.itemsize >= 8:
         with np.errstate(over="ignore"):
             narrow = values.astype(jax.dtypes.canonicalize_dtype(np.float64))
         _check_narrowed(values, narrow)
         return jnp.asarray(narrow)
     return jnp.asarray(values.astype(integer_type(values), copy=False))
+
+
+def _array(values: Any) -> np.ndarray:
+    """An array of numbers as NumPy holds it."""
+    if isinstance(values, str | bytes | os.PathLike):
+        raise TypeError(f"voxels must be an array, not the name {str(values)!r}: jvr.read_volume reads files")
+    if hasattr(values, "dims") and hasattr(values, "coords"):
+        shown = ", ".join(str(name) for name in values.dims)
+        raise TypeError(
+            f"voxels are a {type(values).__name__} with axes {shown}: give .transpose('x', 'y', 'z').values, "
+            "and world_from_grid= for its coordinates"
+        )
+    is_array = any(hasattr(values, name) for name in ("__array__", "__array_interface__", "__dlpack__"))
+    if not is_array and not isinstance(values, Sequence | int | float):
+        raise TypeError(f"voxels must be an array of real numbers, not {type(values).__name__}")
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise TypeError(f"voxels must be an array of real numbers with axes x, y, z: {error}") from None
+    # The small types of machine learning, such as bfloat16, are no kind of NumPy's own.
+    if array.dtype.kind not in "biuf" and not jnp.issubdtype(array.dtype, jnp.floating):
+        found = array.dtype if isinstance(values, np.ndarray) else type(values).__name__
+        raise TypeError(f"voxels must be real or integer numbers, not {found}; give an array of them")
+    return array
+
+
+def as_missing(number: Any) -> float | int | None:
+    """The number that means "no data" as Python's own; NaN needs none.
+
+    **Raises** `TypeError` for what is no number.
+    """
+    if number is None:
+        return None
+    if isinstance(number, bool | str) or np.ndim(number) != 0 or np.asarray(number).dtype.kind not in "iuf":
+        raise TypeError(f"missing must be the stored number that means no data, or None, not {number!r}")
+    plain = np.asarray(number).item()
+    return None if np.isnan(plain) else plain
+
+
+def masked_voxels(values: Any) -> np.ndarray | None:
+    """Where a masked array of NumPy is masked, or `None` where it is not, or no such array."""
+    mask = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else None
+    return mask if mask is not None and mask.any() else None
 
 
 def _check_narrowed(wide: np.ndarray, narrow: np.ndarray) -> None:
@@ -71,21 +116,30 @@ def integer_type(values: np.ndarray) -> np.dtype:
 
 
 def without_gaps(
-    values: Num[Array, "x y z"], missing: float | int | None
+    values: Num[Array, "x y z"], missing: float | int | None, masked: np.ndarray | None = None, gaps: Any = None
 ) -> tuple[Num[Array, "x y z"], UInt8[Array, "x y z"] | None]:
-    """Voxels of which those that are missing, because they equal `missing`, are NaN or lie beyond 1e30, are filled in, and where those
-    are (`gaps`): `None` where there are none.
+    """Voxels of which those that are missing, because they equal `missing`, are NaN, lie beyond 1e30, are `masked` or so in the `gaps` of
+    another volume, are filled in, and where those are (gaps): `None` where there are none.
 
     Near data the mean of what lies around is filled in, so that a gradient sees no step, elsewhere the smallest voxel: the range of values
     stays that of the data. Traced voxels that are NaN stay, since their number would have to be known. **Raises** `ValueError` where every
     voxel is missing.
     """
+    if gaps is not None and np.shape(gaps) != values.shape:
+        raise ValueError(f"gaps have shape {np.shape(gaps)}, the voxels {values.shape}: give one for each voxel")
     voxels = known(values)
     is_float = jnp.issubdtype(values.dtype, jnp.floating)
-    if voxels is None or (missing is None and not is_float):
+    if voxels is None or isinstance(gaps, Tracer):
+        return values, None if gaps is None else jnp.asarray(gaps)
+    if missing is None and masked is None and gaps is None and not is_float:
         return values, None
     absent = np.isnan(voxels) if is_float else np.zeros(voxels.shape, bool)
-    if is_float and (count := np.count_nonzero(huge := (np.abs(voxels) >= HUGE) & np.isfinite(voxels))):
+    if masked is not None:
+        absent |= masked
+    if gaps is not None:
+        absent |= np.asarray(gaps) & VOXEL != 0
+    reaches = is_float and float(jnp.finfo(values.dtype).max) > HUGE
+    if reaches and (count := np.count_nonzero(huge := (np.abs(voxels) >= HUGE) & np.isfinite(voxels) & ~absent)):
         if missing is None or abs(missing) < HUGE:
             warnings.warn(f"{count:,} voxels lie beyond 1e30: they count as missing data and stay empty", stacklevel=4)
         absent |= huge
@@ -133,19 +187,19 @@ def _around(x: Num[Array, "x y z"]) -> Num[Array, "x y z"]:
     return x
 
 
-def typical_range(flat: np.ndarray) -> tuple[float, float]:
-    """Smallest and largest of some numbers, but for a few that lie far out: no more than a millionth of them, and at least one, more than
+def typical_range(flat: np.ndarray, *, few: float = FEW, least: int = 1) -> tuple[float, float]:
+    """Smallest and largest of some numbers, but for a few that lie far out: no more than a share `few` of them, or `least`, more than
     the range of all others but a few thousandths beyond it. One hot voxel does not decide what a range is cut into."""
     flat = flat.reshape(-1)
     low, high = float(flat.min()), float(flat.max())
     subset = flat[:: max(flat.size // SUBSET, 1)].astype(np.float64)
     inner_low, inner_high = np.quantile(subset, [0.001, 0.999])
     spread = float(inner_high - inner_low)
-    few = max(1, int(FEW * flat.size))
+    count = max(least, int(few * flat.size))
     if spread > 0 and high > inner_high + FAR * spread:
         beyond = flat > inner_high + FAR * spread
-        high = float(flat[~beyond].max()) if np.count_nonzero(beyond) <= few else high
+        high = float(flat[~beyond].max()) if np.count_nonzero(beyond) <= count else high
     if spread > 0 and low < inner_low - FAR * spread:
         beyond = flat < inner_low - FAR * spread
-        low = float(flat[~beyond].min()) if np.count_nonzero(beyond) <= few else low
+        low = float(flat[~beyond].min()) if np.count_nonzero(beyond) <= count else low
     return low, high

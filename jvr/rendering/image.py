@@ -75,6 +75,8 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
     with non-finite numbers gives NaN pixels. **Raises** `ValueError` where `settings.sampling` does not support the scene, and where its
     radiance transfer was computed for another (within a compiled program, an error when that runs).
     """
+    if not (isinstance(scene, Scene) and isinstance(camera, AbstractCamera)):
+        raise TypeError(f"jvr.render takes a scene and a camera, not {type(scene).__name__} and {type(camera).__name__}")
     return settings.sampling.render(scene.current(), camera, settings)
 
 

@@ -3,7 +3,6 @@
 import difflib
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -124,7 +123,7 @@ def build_cameras(config: Config, volume: Volume, transfer: AbstractTransfer | N
     return tuple(cameras)
 
 
-def build_fit(config: Config, read_image: Callable[[Path], np.ndarray] | None = None, prepare: Prepare = precomputed) -> FitJob:
+def build_fit(config: Config, read_image: Callable[..., np.ndarray] | None = None, prepare: Prepare = precomputed) -> FitJob:
     """Everything that `jvr.fit` needs; renders the targets of a synthetic experiment.
 
     `prepare`: `jvr.precompute`, or something that takes its keywords.
@@ -297,11 +296,13 @@ def _unknowns(config: Config, fit: FitTable, scene: Scene) -> Callable[[Scene], 
 def _images(config: Config, fit: FitTable, cameras: tuple[AbstractCamera, ...], read_image: Any) -> list[np.ndarray]:
     if read_image is None:
         from jvr.io.images import read_image
+    # Where nothing is behind the volume, light over black is what a picture holds; where that is to be found, nobody knows yet.
+    behind = None if "background" in fit.unknowns else config.tables.background or (0.0, 0.0, 0.0)
     images = []
     for i, name in enumerate(fit.images or ()):
         key = f"fit.images[{i}]"
         with blame(config.where(key), key):
-            images.append(np.asarray(read_image(config.find(name, key))))
+            images.append(np.asarray(read_image(config.find(name, key), background=behind)))
     if len(images) != len(cameras):
         where = config.where("fit.images")
         raise ConfigError(where, "fit.images", f"{len(images)} images for {len(cameras)} cameras: give one for each camera")

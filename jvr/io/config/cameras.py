@@ -1,6 +1,7 @@
 """Cameras from their tables."""
 
 import itertools
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,6 +26,8 @@ VIEWS = {
     "top": [0.0, 0.0, 1.0],
     "bottom": [0.0, 0.0, -1.0],
 }
+# One voxel makes up to eight bricks visible. Groups of so many are specks where they are at most this share of all.
+SPECK, SPECKS = 8, 0.05
 # How much larger than what it shows a picture is.
 MARGIN = 1.05
 
@@ -72,12 +75,26 @@ def _visible_corners(volume: Volume, transfer: AbstractTransfer) -> np.ndarray:
     reach = np.asarray(eqx.filter_jit(occupancy_of)(bricks, volume.slope, volume.intercept, transfer).reach)
     if volume.gaps is not None:
         reach = np.where(_without_data(volume, bricks.size), 1, reach)
-    first = np.argwhere(reach == 0)[:, None] * bricks.size
+    first = np.argwhere(_without_specks(reach == 0))[:, None] * bricks.size
     grid = first + np.array(list(itertools.product((0, bricks.size), repeat=3)))
     low, high = volume.domain
     grid = np.unique(np.clip(grid.reshape(-1, 3), low, high), axis=0)
     matrix = in_double(volume.world_from_grid, volume.remainder)
     return grid @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _without_specks(seen: np.ndarray) -> np.ndarray:
+    """Visible bricks without a few hot voxels: groups of bricks that are so small, where they are a small part of all that is visible."""
+    from scipy import ndimage
+
+    labelled: Any = ndimage.label(seen, np.ones((3, 3, 3)))
+    groups, count = labelled
+    sizes = np.bincount(groups.ravel(), minlength=count + 1)
+    small = sizes <= SPECK
+    small[0] = False
+    if not 0 < sizes[small].sum() <= SPECKS * seen.sum():
+        return seen
+    return seen & ~small[groups]
 
 
 def _without_data(volume: Volume, size: int) -> np.ndarray:

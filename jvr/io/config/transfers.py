@@ -39,6 +39,8 @@ FIELDS = {
 }
 # Optical depth of an automatic window's brightest value, from the centre of the volume to its farthest corner.
 AUTOMATIC_DEPTH = 30.0
+# A window leaves so many voxels out that lie far beyond all others: a share of all, or a number.
+HOT, MOST_HOT = 1e-5, 8
 # Optical depth of one voxel of a label: its front hides what is behind.
 LABEL_DEPTH = 8.0
 
@@ -175,8 +177,9 @@ def contents(volume: Volume) -> tuple[float, float]:
 
     data = volume.data()
     values = data[:: max(data.size // 2**20, 1)].astype(np.float64) * float(volume.slope) + float(volume.intercept)
-    ends = np.sort([float(volume.slope * v + volume.intercept) for v in typical_range(data)])
-    # A hot voxel would take Otsu's bins from all others.
+    far = typical_range(data, few=HOT, least=MOST_HOT)
+    ends = np.sort([float(volume.slope * v + volume.intercept) for v in far])
+    # Hot voxels would take Otsu's bins from all others.
     values = np.clip(values, *ends)
     if values.min() == values.max():
         raise ValueError(f"every voxel has the value {values.min():g}: there is nothing to see")

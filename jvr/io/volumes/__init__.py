@@ -6,6 +6,7 @@ imported before a file asks for it.
 
 import math
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,8 @@ from jvr.model.volume import Volume
 
 __all__ = ["VolumeError", "read_volume"]
 
-Numbers = float | int | Sequence[float | int] | np.ndarray
+Number = float | int | np.number
+Numbers = Number | Sequence[Number] | np.ndarray
 
 RAW = (".raw", ".bin", ".dat")
 # For each ending: the reader and the keywords of `read_volume` that it takes, beside those that place and scale every volume.
@@ -51,11 +53,47 @@ READERS: dict[str, tuple[Callable[[Path, Given], Stored], tuple[str, ...]]] = {
     ".slc": (read_slc, ()),
     ".tif": (read_tiff, ("array", "axes", "channel", "time")),
     ".tiff": (read_tiff, ("array", "axes", "channel", "time")),
+    ".lsm": (read_tiff, ("array", "axes", "channel", "time")),
+    ".stk": (read_tiff, ("array", "axes", "channel", "time")),
     ".npy": (read_npy, ("axes", "channel", "time")),
     ".zarr": (read_zarr, ("array", "axes", "channel", "time")),
     ".zarr.zip": (read_zarr, ("array", "axes", "channel", "time")),
     ".ozx": (read_zarr, ("array", "axes", "channel", "time")),
 } | {ending: (read_raw, ("shape", "dtype")) for ending in RAW}
+# Formats that are not read, and what makes one of them that is.
+REMEDIES: dict[tuple[str, ...], str] = {
+    (".mgz", ".mgh"): "FreeSurfer's format is not read: convert it by `mri_convert a.mgz a.nii.gz`",
+    (".mnc", ".mnc2"): "MINC is not read: convert it by `mnc2nii`",
+    (".par", ".rec"): "Philips PAR/REC is not read: convert it by `dcm2niix`",
+    (
+        ".czi",
+        ".nd2",
+        ".lif",
+        ".oib",
+        ".oif",
+        ".ims",
+        ".vsi",
+    ): "microscopes' own formats are not read: export OME-TIFF, as Fiji does",
+    (".h5", ".hdf5", ".hdf", ".nc", ".mat"): "HDF5, NetCDF and MATLAB files are not read: save one array by numpy.save as .npy",
+    (".npz",): "an archive of several arrays: save one of them by numpy.save as .npy",
+    (".mrc", ".map", ".ccp4"): "MRC is not read: save the array by numpy.save as .npy, and give spacing= in mm",
+    (".vtu", ".vts", ".vtr", ".pvti", ".vtm", ".pvd"): "only image data (.vti, .vtk) is a volume: resample it, as ParaView does",
+    (".vdb",): "sparse OpenVDB grids are not read: save a dense array by numpy.save as .npy",
+    (".png", ".jpg", ".jpeg", ".bmp"): "one picture is no volume: give the folder of all slices",
+    (".ome",): "a companion file that describes others: read one of its .ome.tif files, or export all as one OME-TIFF",
+    (
+        ".zip",
+        ".tar",
+        ".tar.gz",
+        ".tgz",
+        ".7z",
+        ".rar",
+        ".xz",
+        ".bz2",
+        ".zst",
+        ".gz",
+    ): "packed files are not read: unpack it first",
+}
 MEANING = {
     "shape": "shape= and dtype= describe headerless raw files, this file has a header",
     "dtype": "shape= and dtype= describe headerless raw files, this file has a header",
@@ -68,7 +106,7 @@ MEANING = {
 
 
 def read_volume(
-    path: str | os.PathLike,
+    path: str | bytes | os.PathLike,
     *,
     shape: Sequence[int] | None = None,
     dtype: Any = None,
@@ -76,14 +114,14 @@ def read_volume(
     origin: Numbers | None = None,
     array: str | None = None,
     series: str | None = None,
-    axes: str | None = None,
-    channel: int | str | None = None,
-    time: int | None = None,
+    axes: str | Sequence[str] | None = None,
+    channel: int | np.integer | str | None = None,
+    time: int | np.integer | None = None,
     direction: Sequence[Sequence[float]] | np.ndarray | None = None,
-    slope: float | int | None = None,
-    intercept: float | int | None = None,
-    missing: float | int | bool | None = None,
-    nan_value: float | int | None = None,
+    slope: Number | None = None,
+    intercept: Number | None = None,
+    missing: Number | bool | None = None,
+    nan_value: Number | None = None,
 ) -> Volume:
     """Reads a scalar volume and where it lies in the world (millimetres, LPS, as ITK reads it).
 
@@ -118,34 +156,42 @@ def read_volume(
     anything that is not a whole, finite, scalar volume on a regular grid, and the system's own `OSError` (such as
     `FileNotFoundError`) where a file cannot be opened. Warns where float32 loses what sets float64 voxels apart.
     """
-    path = Path(path).expanduser()
+    path = _path(path)
     given = Given(
         shape=shape,
         dtype=dtype,
-        spacing=_three(path, "spacing", [spacing] * 3 if isinstance(spacing, int | float) else spacing, positive=True),
+        spacing=_three(path, "spacing", spacing, positive=True),
         origin=_three(path, "origin", origin, positive=False),
         direction=_direction(path, direction),
-        slope=slope,
-        intercept=intercept,
+        slope=_number(path, "slope", slope),
+        intercept=_number(path, "intercept", intercept),
         array=array,
         series=series,
-        axes=axes,
+        axes=axes if axes is None or isinstance(axes, str) else "".join(map(str, axes)),
         channel=channel,
         time=time,
-        missing=missing,
-        nan_value=nan_value,
+        missing=False if missing is False else _number(path, "missing", missing, ", or False for none; NaN means that by itself"),
+        nan_value=_number(path, "nan_value", nan_value),
     )
-    if nan_value is not None and not math.isfinite(nan_value):
-        raise VolumeError(path, f"nan_value={nan_value} must be a finite number")
-    if missing is True or (missing is not None and not math.isfinite(missing)):
-        raise VolumeError(
-            path, f"missing={missing} must be a finite number, or False for none; NaN voxels are missing by themselves"
-        )
     reader, takes = _reader(path, raw=shape is not None and dtype is not None)
     if superfluous := [key for key in MEANING if getattr(given, key) is not None and key not in takes]:
         raise VolumeError(path, f"{MEANING[superfluous[0]]}: leave {superfluous[0]}= out")
     stored = replaced(reader(path, given), given)
     return to_volume(path, stored, given)
+
+
+def _path(path: Any) -> Path:
+    """The name of a file or folder."""
+    if not isinstance(path, str | bytes | os.PathLike):
+        raise TypeError(
+            f"read_volume takes the name of a file or folder, not {type(path).__name__}; an array becomes a volume by jvr.Volume"
+        )
+    name = os.fsdecode(path)
+    if re.match(r"[a-z][a-z0-9+]+://", name):
+        raise VolumeError(name, "this is an address, and only files are read: download it")
+    if not name or "\0" in name:
+        raise VolumeError(repr(name), "this is no name of a file")
+    return Path(name).expanduser()
 
 
 def _three(path: Path, name: str, numbers: Any, *, positive: bool) -> np.ndarray | None:
@@ -156,10 +202,21 @@ def _three(path: Path, name: str, numbers: Any, *, positive: bool) -> np.ndarray
         values = np.asarray(numbers, float)
     except (TypeError, ValueError):
         values = np.empty(0)
+    # One distance stands for all three.
+    values = np.full(3, values) if positive and values.ndim == 0 else values
     if values.shape != (3,) or not np.isfinite(values).all() or (positive and not (values > 0).all()):
         wanted = "three positive finite numbers" if positive else "three finite numbers"
         raise VolumeError(path, f"{name}={numbers} must be {wanted}, in mm along x, y, z")
     return values
+
+
+def _number(path: Path, name: str, value: Any, also: str = "") -> float | int | None:
+    """A finite number of a keyword."""
+    if value is None:
+        return None
+    if np.ndim(value) or isinstance(value, bool) or np.asarray(value).dtype.kind not in "iuf" or not math.isfinite(value):
+        raise VolumeError(path, f"{name}={value!r} must be a finite number{also}")
+    return np.asarray(value).item()
 
 
 def _direction(path: Path, matrix: Any) -> np.ndarray | None:
@@ -197,6 +254,8 @@ def _reader(path: Path, *, raw: bool) -> tuple[Callable[[Path, Given], Stored], 
         return read_raw, ("shape", "dtype")
     if looks_like_dicom(first_bytes(path, 160)):
         return READERS[".dcm"]
+    if remedy := next((remedy for endings, remedy in REMEDIES.items() if name.endswith(endings)), None):
+        raise VolumeError(path, remedy)
     shown = "".join(path.suffixes[-2:]) if name.endswith(".gz") else path.suffix
     known = ", ".join(ending for ending in READERS)
     problem = f"unsupported extension '{shown}'; supported: {known}, a folder of DICOM, PNG, TIFF, BMP or JPEG slices"

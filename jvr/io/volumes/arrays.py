@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,12 +21,14 @@ def read_raw(path: Path, given: Given) -> Stored:
         problem = "headerless data: give shape=(x, y, z) and dtype= such as 'uint8' or '>i2', and spacing= in mm"
         raise VolumeError(path, problem)
     try:
-        shape, dtype = tuple(int(n) for n in shape), np.dtype(dtype)
+        shape, dtype = tuple(_whole(n) for n in shape), np.dtype(dtype)
     except (TypeError, ValueError) as error:
         raise VolumeError(path, f"shape= must be whole numbers and dtype= a NumPy type: {one_line(error)}") from None
     if not 1 <= len(shape) <= 4 or min(shape) < 1 or dtype.kind not in "biuf":
         raise VolumeError(path, f"shape={shape} and dtype={dtype} must be positive sizes (x, y, z) and a real number type")
     wanted, found = math.prod(shape) * dtype.itemsize, path.stat().st_size
+    if wanted != found and first_bytes(path, 2) == b"\x1f\x8b":
+        raise VolumeError(path, "the voxels are gzip-compressed: unpack the file first")
     if wanted != found:
         size = " x ".join(str(n) for n in shape)
         raise VolumeError(
@@ -35,6 +38,13 @@ def read_raw(path: Path, given: Given) -> Stored:
     return Stored(np.memmap(path, dtype, "r", shape=three_axes(path, shape), order="F"))
 
 
+def _whole(number: Any) -> int:
+    """A number of voxels. **Raises** `ValueError` for parts of a voxel."""
+    if isinstance(number, str) or int(number) != number:
+        raise ValueError(f"{number!r} is none")
+    return int(number)
+
+
 def read_npy(path: Path, given: Given) -> Stored:
     """A NumPy array file, never unpickled. The caller's `axes` names its axes, of which `channel` and `time` choose a volume."""
     start = first_bytes(path)
@@ -42,8 +52,8 @@ def read_npy(path: Path, given: Given) -> Stored:
         raise mislabelled(path, start, "a NumPy array file (.npy)")
     shape, dtype = _npy_header(path)
     if dtype.kind not in "biufc":
-        problem = f"the array holds {'Python objects' if dtype.hasobject else dtype}, which are never unpickled"
-        raise VolumeError(path, f"{problem}; save an array of real numbers")
+        problem = "Python objects, which are never unpickled" if dtype.hasobject else f"{dtype}, which is no type of real numbers"
+        raise VolumeError(path, f"the array holds {problem}; save it as float32, for example")
     if len(shape) == 0 or min(shape) < 1:
         raise VolumeError(path, f"the array has shape {shape}; a volume needs three non-empty axes")
     # The header is followed by the data and ends at a multiple of 16 bytes; its length is of no account here.

@@ -41,6 +41,8 @@ class VolumeError(ValueError):
 def first_bytes(path: Path, count: int = 65536) -> bytes:
     """The beginning of a file that exists, may be read and is not empty."""
     if not path.exists():
+        if path.is_symlink():
+            raise FileNotFoundError(f"{path}: a link to {os.readlink(path)}, which is not there; copy or fetch the file itself")
         folder = os.listdir(path.parent) if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, folder, 1, 0.6)
         raise FileNotFoundError(f"{path}: no such file" + (f"; did you mean {near[0]!r}?" if near else ""))

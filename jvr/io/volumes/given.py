@@ -25,7 +25,7 @@ class Given:
     array: str | None = None
     series: str | None = None
     axes: str | None = None
-    channel: int | str | None = None
-    time: int | None = None
+    channel: int | np.integer | str | None = None
+    time: int | np.integer | None = None
     missing: float | int | bool | None = None
     nan_value: float | int | None = None

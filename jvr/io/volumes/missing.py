@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from jvr.io.volumes.stored import Stored
 
 # What CT scanners write outside of the circle that they reconstruct (as stored, and in HU), and others where there is nothing.
-PADDING = (-2000.0, -3024.0, -32768.0, -9999.0, -99999.0, -999999.0, -2147483648.0)
+PADDING = (-2000.0, -3024.0, -32768.0, -999.0, -9999.0, -99999.0, -999999.0, -2147483648.0)
+ENORMOUS = 1e20
 # By how much of its own size a padding is set apart from the smallest voxel beside it.
 APART = 0.1
 
@@ -51,8 +52,18 @@ def _count(path: Path, kept: np.ndarray, number: float) -> int:
     return count
 
 
+def _enormous(kept: np.ndarray) -> float | None:
+    """1e20, as models of oceans and the air write where there is nothing, or its negative."""
+    for number in (float(np.nanmin(kept)), float(np.nanmax(kept))):
+        if kept.dtype.type(ENORMOUS) == abs(number) and np.abs(kept[kept != number]).max(initial=0) < 1e-3 * ENORMOUS:
+            return number
+    return None
+
+
 def _guessed(stored: "Stored", kept: np.ndarray) -> float | None:
     """The smallest number where it is known to be a padding, and far from the next."""
+    if kept.dtype.kind == "f" and kept.dtype.itemsize > 2 and (found := _enormous(kept)) is not None:
+        return found
     number = float(np.nanmin(kept))
     if number not in PADDING and round(stored.slope * number + stored.intercept, 3) not in PADDING:
         return None

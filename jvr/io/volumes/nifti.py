@@ -147,7 +147,7 @@ def _affine(path: Path, header: _Header, given: Given) -> np.ndarray:
     matrix = np.eye(4)
     if given.spacing is not None and given.direction is not None:
         placed = None
-    elif header.sform is not None:
+    elif header.sform is not None and _spans(path, header):
         placed = header.sform
         _compare(path, header, sizes, given)
     else:
@@ -163,8 +163,18 @@ def _affine(path: Path, header: _Header, given: Given) -> np.ndarray:
     if not np.isfinite(lps).all():
         raise VolumeError(path, "its sform or qform is not finite: export the file again, or give spacing= and direction=")
     matrix[:3, :3], matrix[:3, 3] = completed(lps[:, :3]), lps[:, 3]
-    check_volume(path, "sform" if header.sform is not None else "qform", matrix[:3, :3])
+    check_volume(path, "sform" if placed is header.sform else "qform", matrix[:3, :3])
     return matrix
+
+
+def _spans(path: Path, header: _Header) -> bool:
+    """Whether the sform has a direction for each axis; one of zeros with a code that announces it is said, and not taken."""
+    assert header.sform is not None
+    axes = [axis for axis in range(min(len(header.dim), 3)) if header.dim[axis] > 1]
+    if header.sform[:, axes].any(axis=0).all():
+        return True
+    payload.said(path, "its sform has axes of length 0; it is left out, and the qform or pixdim taken")
+    return False
 
 
 def _of_quaternion(header: _Header, sizes: list[float]) -> np.ndarray:
@@ -184,11 +194,20 @@ def _of_quaternion(header: _Header, sizes: list[float]) -> np.ndarray:
 
 
 def _compare(path: Path, header: _Header, sizes: list[float], given: Given) -> None:
-    """Says where pixdim and the sform give the voxel other sizes."""
-    lengths = np.linalg.norm(header.sform[:, :3], axis=0) if header.sform is not None else np.array(sizes)
+    """Says where pixdim and the sform give the voxel other sizes, or the qform puts voxels elsewhere."""
+    assert header.sform is not None
+    lengths = np.linalg.norm(header.sform[:, :3], axis=0)
     axes = [axis for axis in range(min(len(header.dim), 3)) if header.dim[axis] > 1]
     if given.spacing is None and any(abs(lengths[k] - sizes[k]) > 1e-2 * sizes[k] for k in axes):
         stated, found = (" x ".join(f"{x[k]:.4g}" for k in axes) for x in (sizes, lengths))
         payload.said(
             path, f"pixdim says voxels of {stated}, the sform {found}; the sform is taken (give spacing= where it is wrong)"
         )
+    if header.qform is None or given.spacing is not None or (given.direction is not None and given.origin is not None):
+        return
+    corners = np.array([[i, j, k, 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)], float)
+    corners[:, :3] *= [header.dim[axis] - 1 if axis < len(header.dim) else 0 for axis in range(3)]
+    apart = np.linalg.norm(corners @ (_of_quaternion(header, sizes) - header.sform).T, axis=1).max()
+    if apart > 0.5 * lengths[axes].min(initial=np.inf):
+        problem = f"the qform puts voxels up to {apart:.4g} away from where the sform does; the sform is taken"
+        payload.said(path, f"{problem} (direction= and origin= replace it)")

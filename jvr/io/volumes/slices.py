@@ -103,14 +103,14 @@ def _slice(file: Path) -> np.ndarray:
                 file, f"it holds {values.shape[2]} pages, where a folder's slices hold one each; read it by its own name"
             )
         return values[..., 0]
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     try:
         # The size is read from the header; Pillow refuses bombs before it decodes.
         with warnings.catch_warnings(), Image.open(file, formats=[KINDS[file.suffix.lower()]]) as picture:
             warnings.simplefilter("ignore")
             check_size(file, picture.size, 4, None)
-            return _grey(file, picture).T
+            return _grey(file, ImageOps.exif_transpose(picture)).T
     except VolumeError:
         raise
     except Exception as error:

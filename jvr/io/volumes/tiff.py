@@ -13,6 +13,7 @@ from jvr.io.volumes.given import Given
 from jvr.io.volumes.jpeg import jpeg_size
 from jvr.io.volumes.ome_xml import OmeImage, completed, ome_images, ome_spacing
 from jvr.io.volumes.stored import Stored, affine_of
+from jvr.io.volumes.tiff_makers import makers_spacing
 from jvr.io.volumes.units import length_of, millimetres
 
 MAGIC = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
@@ -83,6 +84,10 @@ def _read(path: Path, file: Any, given: Given, messages: list[str]) -> Stored:
     names = _axes(path, series, given)
     found = chosen(path, series.shape, names, given, _channels(series, names, image))
     values = found.of(series.asarray())
+    orientation = int(series.keyframe.tags.valueof(274, 1) or 1)
+    if orientation != 1:
+        problem = f"its tag Orientation is {orientation}: row 0 is not the top, or column 0 not the left"
+        warnings.warn(f"{path}: {problem}; voxels are read in the order that they are stored in", stacklevel=2)
     if series.keyframe.photometric == 0:
         warnings.warn(
             f"{path}: its pages say that 0 is white (WhiteIsZero); the numbers are read as they are stored", stacklevel=2
@@ -95,8 +100,11 @@ def _series(path: Path, file: Any, images: list[OmeImage], given: Given, message
     pages, found = len(file.pages), list(file.series)
     _refuse_damage(path, messages)
     names = [image.name for image in images] if len(images) == len(found) else [series.name for series in found]
-    if given.array is None and len(found) == 1:
-        return 0, found[0]
+    # Thumbnails and pictures of lower resolution are marked as such.
+    whole = [k for k, series in enumerate(found) if not series.keyframe.is_reduced]
+    if given.array is None and (len(whole) == 1 or len(found) == 1):
+        number = whole[0] if whole else 0
+        return number, found[number]
     shown = ", ".join(f"{k} '{name}' {series.shape}" for k, (name, series) in enumerate(zip(names[:4], found[:4], strict=True)))
     if given.array is None:
         raise VolumeError(path, f"its {pages} pages form {len(found)} images: {shown}; choose one with array=, by its number")
@@ -129,6 +137,9 @@ def _check_pages(path: Path, series: Any) -> None:
         if ends and max(ends) > size:
             raise VolumeError(path, f"the pages end at byte {max(ends):,}, the file at {size:,}: it is cut short")
         whole, stored = whole and bool(ends), stored + sum(one.databytecounts)
+    if series.dataoffset is not None and most == 1:
+        # Planes may lie behind the one page that there is.
+        stored = max(stored, page.parent.filehandle.size - series.dataoffset)
     if most is not None and whole:
         bits = page.bitspersample if page.bitspersample < 8 else 8 * series.dtype.itemsize
         announced = math.prod(series.shape) * bits // 8
@@ -199,6 +210,8 @@ def _spacing(path: Path, file: Any, series: Any, image: OmeImage | None, found: 
         return [1.0, 1.0, 1.0]
     if image is not None:
         return ome_spacing(path, image.pixels, depth, given)
+    if (sizes := makers_spacing(path, file, depth)) is not None:
+        return sizes
     tags = series.keyframe.tags
     sizes = [_pixel(tags, "XResolution"), _pixel(tags, "YResolution")]
     unit = RESOLUTION_UNITS.get(int(tags["ResolutionUnit"].value)) if "ResolutionUnit" in tags else 25.4

@@ -96,9 +96,21 @@ def _found(path: Path, zarr: Any, node: Any, given: Given) -> tuple[Any, Level |
             return _array(path, zarr, inner, level.path), level
     if name is None or not isinstance(inner, zarr.Array):
         return _array(path, zarr, node, name), None
+    _say_coordinates(path, node, name, inner)
     above, _, last = name.strip("/").rpartition("/")
     parent = node.get(above) if above else node
     return inner, _level(path, parent, last, given) if isinstance(parent, zarr.Group) else None
+
+
+def _say_coordinates(path: Path, node: Any, name: str, array: Any) -> None:
+    """Says that arrays beside this one, called like its axes as xarray writes them, hold positions that are not read."""
+    above = name.strip("/").rpartition("/")[0]
+    group = node.get(above) if above else node
+    names = getattr(array.metadata, "dimension_names", None) or array.attrs.get("_ARRAY_DIMENSIONS") or []
+    found = [str(axis) for axis in names if str(axis) in group]
+    if found:
+        problem = f"the coordinates in its arrays {', '.join(found)} are not read: voxels are taken for 1 mm"
+        warnings.warn(f"{path}: {problem}; give spacing= and origin= in mm", stacklevel=2)
 
 
 def _array(path: Path, zarr: Any, group: Any, name: str | None) -> Any:

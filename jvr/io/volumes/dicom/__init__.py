@@ -9,7 +9,7 @@ from pathlib import Path
 
 from jvr.io.volumes.dicom.frames import frames_of
 from jvr.io.volumes.dicom.geometry import chosen, placed
-from jvr.io.volumes.dicom.headers import Header, guarded, header, headers_in, looks_like_dicom, quiet
+from jvr.io.volumes.dicom.headers import Header, guarded, header, headers_in, looks_like_dicom, parsed, quiet
 from jvr.io.volumes.dicom.pixels import stored_pixels
 from jvr.io.volumes.errors import VolumeError, first_bytes, mislabelled
 from jvr.io.volumes.given import Given
@@ -26,6 +26,8 @@ def read_dicom_file(path: Path, given: Given) -> Stored:
     notes: list[str] = []
     with quiet(), guarded(path):
         found = header(path)
+        if found is None and (path.name.upper() == "DICOMDIR" or "DirectoryRecordSequence" in parsed(path)):
+            raise VolumeError(path, "this is a DICOMDIR, a list of files: give the folder that holds it")
         if found is None:
             raise VolumeError(path, "this DICOM object holds no picture (a report, plan, structure set or presentation state)")
         stored = _read(path, [found], given, notes)
@@ -36,7 +38,7 @@ def read_dicom_folder(folder: Path, given: Given) -> Stored:
     """The one series in a folder, or the one whose id is `series`; localisers give way to other series."""
     notes: list[str] = []
     with quiet(), guarded(folder):
-        pictures, without = headers_in(folder)
+        pictures, without = headers_in(folder, notes)
         if not pictures:
             also = f" ({sum(without.values())} DICOM objects without a picture)" if without else ""
             raise VolumeError(folder, f"the folder holds no DICOM series{also}; give a folder of DICOM slices, or a volume file")

@@ -31,6 +31,7 @@ TIMES = {
     "b-value": ("DiffusionBValue",),
     "gradient": ("DiffusionGradientOrientation",),
     "trigger time": ("NominalCardiacTriggerDelayTime", "TriggerTime"),
+    "angular view": ("AngularViewVector",),
     "phase": ("PhaseVector",),
     "time slot": ("TimeSlotVector",),
     "time slice": ("TimeSliceVector",),
@@ -47,6 +48,8 @@ SEQUENCES = (
     "MRDiffusionSequence",
     "TemporalPositionSequence",
 )
+# The element that a pointer to slices of nuclear medicine names: SliceVector.
+SLICES = 0x00540080
 UNITS = {"US": "", "UNSPECIFIED": "", "NORMALIZED": "", "BQML": "Bq/ml", "GY": "Gy", "CNTS": "", "RELATIVE": "", "NONE": ""}
 
 
@@ -98,6 +101,7 @@ def frames_of(header: Header, given: Given, notes: list[str]) -> list[Frame]:
         raise VolumeError(header.file, f"it announces {columns} x {rows} pixels and {count} frames: the file is damaged")
     if (samples := header.whole("SamplesPerPixel", 1)) != 1:
         raise VolumeError(header.file, f"its pictures are in colour ({samples} samples a pixel); save them as grey ones")
+    _refuse_tiles(header, rows, columns, count)
     bits = header.whole("BitsAllocated", 16)
     compressed = header.syntax.startswith("1.2.840.10008.1.2.4") or header.syntax in RATIO_UNKNOWN
     stored = max(header.bytes_stored, HARMLESS // 1100) if compressed else header.bytes_stored
@@ -117,6 +121,17 @@ def frames_of(header: Header, given: Given, notes: list[str]) -> list[Frame]:
     if not per_frame and count > 1:
         _place_from_first(header, frames, given, notes)
     return frames
+
+
+def _refuse_tiles(header: Header, rows: int, columns: int, count: int) -> None:
+    """Refuses pictures that are laid out beside each other, which are neither slices nor one behind the other."""
+    if count == 1 and "MOSAIC" in [str(word).upper() for word in header.dataset.get("ImageType") or []]:
+        problem = "its picture is a mosaic of all slices (ImageType MOSAIC)"
+        raise VolumeError(header.file, f"{problem}: split it, as `dcm2niix` does, and read the NIfTI file")
+    whole = [header.whole(f"TotalPixelMatrix{name}", 0) for name in ("Columns", "Rows")]
+    if whole[0] > columns or whole[1] > rows:
+        problem = f"its frames are tiles of one slide of {whole[0]} x {whole[1]} pixels, not slices of a volume"
+        raise VolumeError(header.file, f"{problem}: export the slide as one picture")
 
 
 RATIO_UNKNOWN = ("1.2.840.10008.1.2.5", "1.2.840.10008.1.2.1.99")
@@ -187,7 +202,8 @@ def _pixel_spacing(header: Header, groups: _Groups, given: Given) -> tuple[float
             numbers = numbers or header.numbers(name, groups.get(name), 2, positive=True, ignored=True)
     regions = header.dataset.get("SequenceOfUltrasoundRegions")
     # Unit 3 is the centimetre.
-    if numbers is None and regions and regions[0].get("PhysicalUnitsXDirection") == 3:
+    units = [regions[0].get(f"PhysicalUnits{axis}Direction") for axis in "XY"] if regions else []
+    if numbers is None and units == [3, 3]:
         steps = [abs(float(regions[0].get(name) or 0)) * 10 for name in ("PhysicalDeltaY", "PhysicalDeltaX")]
         numbers = steps if min(steps) > 0 and all(map(math.isfinite, steps)) else None
     return None if numbers is None else (numbers[1], numbers[0])
@@ -252,13 +268,16 @@ def _place_from_first(header: Header, frames: list[Frame], given: Given, notes: 
     offsets = dataset.get("GridFrameOffsetVector")
     # Frame time and frame time vector: a film, whose frames are points in time.
     film = any(tag in (0x00181063, 0x00181065) for tag in pointers)
+    # Of nuclear medicine, pictures from one detector or angle each, or counted one after the other, unless they run through slices.
+    flat = any(tag >> 16 == 0x0054 for tag in pointers) and SLICES not in pointers
     for k, frame in enumerate(frames):
         if film:
             frame.told_apart["frame"] = k
         elif offsets is None and first.position is None:
             frame.position = None
-    if film or first.position is None or first.axes is None:
+    if film or flat or first.position is None or first.axes is None:
         return
+    origin = first.position
     normal = np.cross(first.axes[:, 0], first.axes[:, 1])
     if offsets is not None:
         steps = np.array(header.numbers("GridFrameOffsetVector", offsets, len(frames)))
@@ -275,4 +294,4 @@ def _place_from_first(header: Header, frames: list[Frame], given: Given, notes: 
             notes.append(f"SpacingBetweenSlices is missing; frames are taken to be {step:g} mm apart: give spacing= in mm")
         steps = np.arange(len(frames)) * step
     for frame, step in zip(frames, steps, strict=True):
-        frame.position = first.position + step * normal
+        frame.position = origin + step * normal

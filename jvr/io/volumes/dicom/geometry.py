@@ -166,9 +166,11 @@ def _instance(frame: Frame) -> tuple[str, float]:
     return str(frame.told_apart.get("frame time", "")), (number or [0.0])[0] + frame.index * 1e-6
 
 
-def _chosen_channel(path: Path, frames: list[Frame], kinds: list[str], channel: int | str | None) -> list[Frame]:
+def _chosen_channel(path: Path, frames: list[Frame], kinds: list[str], channel: int | np.integer | str | None) -> list[Frame]:
     labels = _labels(frames, kinds)
     names = [_shown(kinds, label) for label in labels]
+    if isinstance(channel, np.integer) or (isinstance(channel, str) and channel not in names and channel.isdecimal()):
+        channel = int(channel)
     count = collections.Counter(_label(frame, kinds) for frame in frames)
     shown = ", ".join(
         f"{k}: '{name}' ({count[label]})" for k, (name, label) in enumerate(zip(names, labels, strict=True)) if k < 12
@@ -183,13 +185,14 @@ def _chosen_channel(path: Path, frames: list[Frame], kinds: list[str], channel: 
         return frames
     if len(labels) < 2 and channel != 0:
         raise VolumeError(path, f"channel={channel}: it has a single channel, leave channel= out")
-    index = channel if isinstance(channel, int) else next((k for k, name in enumerate(names) if name == channel), -1)
+    named = next((k for k, name in enumerate(names) if name == channel), -1)
+    index = channel if isinstance(channel, int) and not isinstance(channel, bool) else named
     if not 0 <= index < len(labels):
         raise VolumeError(path, f"channel={channel!r} is not there; it may be an index or a name of {shown}")
     return [frame for frame in frames if _label(frame, kinds) == labels[index]]
 
 
-def _chosen_time(path: Path, frames: list[Frame], kinds: list[str], time: int | None) -> list[Frame]:
+def _chosen_time(path: Path, frames: list[Frame], kinds: list[str], time: int | np.integer | None) -> list[Frame]:
     labels = _labels(frames, kinds)
     if time is None and len(labels) < 2:
         return frames
@@ -209,7 +212,13 @@ def placed(path: Path, frames: list[Frame], alike: list[Frame], given: Given, no
     """Frames of one volume along their third axis."""
     first = frames[0]
     if first.spacing is None and given.spacing is None:
-        notes.append("PixelSpacing is missing; pixels are taken to be 1 mm wide: give spacing= in mm")
+        ratio = first.source.numbers("PixelAspectRatio", first.source.dataset.get("PixelAspectRatio"), 2, ignored=True)
+        also = (
+            ""
+            if ratio is None or ratio[0] == ratio[1]
+            else f" and as high, though PixelAspectRatio is {ratio[0]:g} to {ratio[1]:g}"
+        )
+        notes.append(f"PixelSpacing is missing; pixels are taken to be 1 mm wide{also}: give spacing= in mm")
     if first.axes is None or any(frame.position is None for frame in frames):
         return _unplaced(frames, given, notes)
     if len(frames) == 1 and len(_places(alike)) == 1:
@@ -269,7 +278,8 @@ def _even_step(path: Path, frames: list[Frame], given: Given, notes: list[str]) 
     step = count @ positions / (count @ count)
     normal = _normal(frames[0])
     gaps = np.diff(positions @ normal)
-    typical = float(np.median(gaps))
+    # One that is there, not the mean of two.
+    typical = float(np.percentile(gaps, 50, method="lower"))
     odd = int(np.argmax(abs(gaps - typical)))
     off = positions - positions.mean(0) - count[:, None] * step
     along, across = abs(off @ normal), np.linalg.norm(off - np.outer(off @ normal, normal), axis=1)

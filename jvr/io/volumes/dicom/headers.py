@@ -12,6 +12,7 @@ import mmap
 import re
 import warnings
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,21 @@ from jvr.io.volumes.errors import VolumeError, first_bytes, one_line
 
 DEFLATED, DEFLATED_HEADER = b"1.2.840.10008.1.2.1.99", 1 << 24
 IMPLICIT_LITTLE = "1.2.840.10008.1.2"
+# Endings of slices.
+SLICES = (".dcm", ".dicom", ".ima")
 ENDS_IN_PICTURE = ("Rows", "Columns")
+# Elements that hold pixels: the first of them, and those of floating-point numbers.
+PIXELS, FLOAT_PIXELS = 0x7FE00008, (0x7FE00008, 0x7FE00009)
 
 
 @dataclasses.dataclass(eq=False)
 class Header:
-    """One file with a picture: its dataset up to the pixel data."""
+    """One file with a picture: its dataset up to the pixel data, and whether these are floating-point numbers."""
 
     file: Path
     dataset: Any
     bytes_stored: int
+    is_float: bool = False
 
     @property
     def syntax(self) -> str:
@@ -111,12 +117,18 @@ def looks_like_dicom(start: bytes) -> bool:
     return bool(explicit or implicit)
 
 
-def parsed(file: Path, *, pixels: int | None = None) -> Any:
-    """The dataset of a file, up to the pixel data, or with these where `pixels` says how many bytes they may have."""
+def parsed(file: Path, *, pixels: int | None = None, ends: Callable[[int], Any] = lambda _: None) -> Any:
+    """The dataset of a file, up to the pixel data, or with these where `pixels` says how many bytes they may have; `ends` is told the tag
+    of what it ends before."""
     import pydicom
     from pydicom.dataset import FileMetaDataset
-    from pydicom.filereader import read_dataset
+    from pydicom.filereader import read_dataset, read_partial
     from pydicom.uid import UID
+
+    def stop(tag: Any, vr: str | None, length: int) -> bool:
+        if tag >= PIXELS:
+            ends(int(tag))
+        return tag >= PIXELS
 
     with guarded(file), file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
         start = content[:1024]
@@ -124,36 +136,47 @@ def parsed(file: Path, *, pixels: int | None = None) -> Any:
         if DEFLATED in start and start[preamble : preamble + 6] == b"\x02\x00\x00\x00UL":
             begin = preamble + 12 + int.from_bytes(start[preamble + 8 : preamble + 12], "little")
             inflated = zlib.decompressobj(-zlib.MAX_WBITS).decompress(content[begin:], DEFLATED_HEADER + (pixels or 0))
-            stop = None if pixels is not None else lambda tag, vr, length: tag >= 0x7FE00008
-            dataset = read_dataset(io.BytesIO(inflated), False, True, stop_when=stop)
+            dataset = read_dataset(io.BytesIO(inflated), False, True, stop_when=stop if pixels is None else None)
             dataset.file_meta = FileMetaDataset()
             dataset.file_meta.TransferSyntaxUID = UID(DEFLATED.decode())
             return dataset
-        return pydicom.dcmread(content, stop_before_pixels=pixels is None, force=True)  # pyright: ignore[reportArgumentType]
+        if pixels is None:
+            return read_partial(content, stop_when=stop, force=True)  # pyright: ignore[reportArgumentType]
+        return pydicom.dcmread(content, force=True)  # pyright: ignore[reportArgumentType]
 
 
 def header(file: Path) -> Header | None:
     """The header of a file that holds a picture; `None` for reports, plans, presentation states, directories."""
-    dataset = parsed(file)
+    tags: list[int] = []
+    dataset = parsed(file, ends=tags.append)
     with guarded(file):
         if not all(name in dataset for name in ENDS_IN_PICTURE):
             if "SOPClassUID" not in dataset and "MediaStorageSOPClassUID" not in getattr(dataset, "file_meta", {}):
                 raise VolumeError(file, "this DICOM file is damaged and cannot be read; copy it again or remove it")
             return None
-        return Header(file, dataset, file.stat().st_size)
+        return Header(file, dataset, file.stat().st_size, bool(tags) and tags[0] in FLOAT_PIXELS)
 
 
-def headers_in(folder: Path) -> tuple[list[Header], dict[str, int]]:
-    """The pictures of a folder and of those below it, and how many files of other kinds of DICOM objects there are."""
-    pictures, others = [], {}
+def headers_in(folder: Path, notes: list[str]) -> tuple[list[Header], dict[str, int]]:
+    """The pictures of a folder and of those below it, and how many files of other kinds of DICOM objects there are.
+
+    Files that should be slices and are not, since they were cut short or are links that lead nowhere, are noted: the first or last slice of
+    a series is missed by nobody.
+    """
+    pictures, others, odd = [], {}, []
     for file in sorted(folder.rglob("*")):
-        if not file.is_file() or file.name.upper() == "DICOMDIR" or file.stat().st_size == 0:
+        if file.is_dir() or file.name.startswith(".") or file.name.upper() == "DICOMDIR":
             continue
-        if not looks_like_dicom(first_bytes(file, 160)):
+        if not file.is_file() or file.stat().st_size == 0 or not looks_like_dicom(first_bytes(file, 160)):
+            empty = file.is_symlink() or (file.is_file() and file.stat().st_size == 0)
+            odd += [file.name] if empty or file.suffix.lower() in SLICES or not file.suffix else []
             continue
         found = header(file)
         if found is not None:
             pictures.append(found)
         else:
             others["objects without a picture"] = others.get("objects without a picture", 0) + 1
+    if odd and pictures:
+        shown = ", ".join(odd[:3]) + (f" and {len(odd) - 3} more" if len(odd) > 3 else "")
+        notes.append(f"it holds files that are empty or no DICOM, and left out: {shown}; copy them again where they are slices")
     return pictures, others

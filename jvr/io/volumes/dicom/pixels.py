@@ -65,7 +65,9 @@ def stored_pixels(path: Path, placed: Placed, given: Given, notes: list[str]) ->
                 values[k][stored == padding] = missing
             missing = float(scaled) if missing is None else missing
     if any(source.text("PhotometricInterpretation") == "MONOCHROME1" for source in types):
-        notes.append("MONOCHROME1: small values are meant to be shown bright; the values are kept as they are")
+        notes.append(
+            "MONOCHROME1: small values are meant to be shown bright; the values are kept as they are: slope=-1 turns them round"
+        )
     _say_what_is_left_out(frames[0], notes)
     return Stored(values.T, placed.world_from_grid, slope, intercept, missing, frames[0].unit)
 
@@ -76,6 +78,15 @@ def _say_what_is_left_out(frame: Frame, notes: list[str]) -> None:
         notes.append("its Modality LUT is not applied: values are those stored")
     if frame.source.text("PhotometricInterpretation") == "PALETTE COLOR":
         notes.append("its colour palette is not applied: values are the indices into it")
+    if (mapping := _real_world(frame)) is not None:
+        slope, intercept = (
+            float(mapping.get(f"RealWorldValue{name}") or default) for name, default in (("Slope", 1), ("Intercept", 0))
+        )
+        if (slope, intercept) != (frame.slope, frame.intercept):
+            name = str(mapping.get("LUTLabel") or "").strip()[:40]
+            notes.append(
+                f"its real-world values {name!r}, {slope:g} * stored + {intercept:g}, are not applied: slope= and intercept= do"
+            )
     imager = dataset.get("ImagerPixelSpacing")
     if (
         imager is not None
@@ -88,6 +99,20 @@ def _say_what_is_left_out(frame: Frame, notes: list[str]) -> None:
         notes.append(f"a projection radiograph, no slice: its pixel size is {kind}")
 
 
+def _real_world(frame: Frame) -> Any:
+    """The mapping of a frame to real-world values by a slope, where it has one."""
+    dataset = frame.source.dataset
+    places = [
+        (dataset.get("PerFrameFunctionalGroupsSequence") or [])[frame.index :],
+        dataset.get("SharedFunctionalGroupsSequence") or [],
+    ]
+    for place in (*(place[0] for place in places if place), dataset):
+        for mapping in place.get("RealWorldValueMappingSequence") or []:
+            if mapping.get("RealWorldValueSlope") is not None:
+                return mapping
+    return None
+
+
 def _type(header: Header) -> np.dtype:
     """The type of stored values."""
     if header.dataset.get("BitsAllocated") == 1:
@@ -95,6 +120,10 @@ def _type(header: Header) -> np.dtype:
     bits = header.whole("BitsAllocated")
     if bits not in (8, 16, 32, 64):
         raise VolumeError(header.file, f"BitsAllocated is {bits}; 1, 8, 16, 32 or 64 would be right: export it again")
+    if header.is_float:
+        if bits < 32:
+            raise VolumeError(header.file, f"BitsAllocated is {bits} for floating-point pixels; 32 or 64 would be right")
+        return np.dtype(f"f{bits // 8}")
     stored, high = header.whole("BitsStored", bits), header.whole("HighBit", header.whole("BitsStored", bits) - 1)
     if not 1 <= stored <= high + 1 <= bits:
         raise VolumeError(header.file, f"BitsStored {stored} and HighBit {high} do not fit {bits} bits: its header is wrong")
@@ -124,10 +153,11 @@ def _interpreted(header: Header, pixels: np.ndarray, dtype: np.dtype, notes: lis
 
 def _padded(header: Header, stored: np.ndarray) -> tuple[np.ndarray, float | None]:
     """The stored number of pixels without data, put in the place of a whole range of such numbers."""
-    value = _padding(header, "PixelPaddingValue", stored.dtype)
+    kind = "" if stored.dtype.kind in "iu" else "Float" if stored.dtype.itemsize == 4 else "DoubleFloat"
+    value = _padding(header, f"{kind}PixelPaddingValue", stored.dtype)
     if value is None:
         return stored, None
-    limit = _padding(header, "PixelPaddingRangeLimit", stored.dtype)
+    limit = _padding(header, f"{kind}PixelPaddingRangeLimit", stored.dtype)
     if limit is not None and limit != value:
         low, high = min(value, limit), max(value, limit)
         stored = np.where((stored >= low) & (stored <= high), np.array(value, stored.dtype), stored)
