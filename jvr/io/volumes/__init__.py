@@ -118,7 +118,8 @@ def read_volume(
     anything that is not a whole, finite, scalar volume on a regular grid, and the system's own `OSError` (such as
     `FileNotFoundError`) where a file cannot be opened. Warns where float32 loses what sets float64 voxels apart.
     """
-    path = Path(path).expanduser()
+    # Unlike the method of Path, this leaves "~name" as it is where there is no such user.
+    path = Path(os.path.expanduser(path))
     given = Given(
         shape=shape,
         dtype=dtype,
