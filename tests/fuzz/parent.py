@@ -11,6 +11,7 @@ import queue
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -30,22 +31,29 @@ class Outcome:
     faults: list[str] = dataclasses.field(default_factory=list)
 
 
-def findings(names: list[str], count: int, number: int = 0, together: int = 1) -> dict[str, Outcome]:
-    """What came out, by format; `together`: processes at a time."""
+Report = Callable[[str, Outcome], None]
+
+
+def findings(
+    names: list[str], count: int, number: int = 0, together: int = 1, report: Report = lambda name, outcome: None
+) -> dict[str, Outcome]:
+    """What came out, by format; `together`: processes at a time; `report` is told of each format that is done."""
     found = {name: Outcome() for name in names}
     with concurrent.futures.ThreadPoolExecutor(together) as pool:
-        for _ in pool.map(lambda k: _lives(names[k::together], count, number, found), range(together)):
+        for _ in pool.map(lambda k: _lives(names[k::together], count, number, found, report), range(together)):
             pass
     return found
 
 
-def _lives(names: list[str], count: int, number: int, found: dict[str, Outcome]) -> None:
+def _lives(names: list[str], count: int, number: int, found: dict[str, Outcome], report: Report) -> None:
     jobs = [(name, -1) for name in names]
     while jobs:
-        jobs = _one_life(jobs, count, number, found)
+        jobs = _one_life(jobs, count, number, found, report)
 
 
-def _one_life(jobs: list[tuple[str, int]], count: int, number: int, found: dict[str, Outcome]) -> list[tuple[str, int]]:
+def _one_life(
+    jobs: list[tuple[str, int]], count: int, number: int, found: dict[str, Outcome], report: Report
+) -> list[tuple[str, int]]:
     """Runs one process; what remains to be done behind the file that ended it."""
     words = [word for name, first in jobs for word in (name, str(first))]
     command = [sys.executable, str(HERE / "child.py"), str(number), str(count), *words]
@@ -68,6 +76,8 @@ def _one_life(jobs: list[tuple[str, int]], count: int, number: int, found: dict[
                 child.kill()
                 break
             said = json.loads(line) if line else {}
+            if line and at is not None and said.get("format") != at[0]:
+                report(at[0], found[at[0]])
             if said.get("done"):
                 return []
             if "accepted" in said and at is not None:
@@ -101,9 +111,16 @@ if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
         known = list(all_seeds(Path(folder)))
     seed = int(sys.argv[2]) if len(sys.argv) > 2 else 0
-    result = findings(sys.argv[3:] or known, int(sys.argv[1]), seed, os.cpu_count() or 1)
-    print("format: files, accepted, refused, seconds, most MiB, faults")
-    for name, outcome in result.items():
+    print("format: files, accepted, refused, seconds, most MiB, faults", flush=True)
+
+    def report(name: str, outcome: Outcome) -> None:
         numbers = f"{outcome.accepted + outcome.refused}, {outcome.accepted}, {outcome.refused}, {outcome.seconds:.0f}"
-        print(f"{name}: {numbers}, {outcome.memory / 2**20:.1f}, {len(outcome.faults)}", *outcome.faults[:20], sep="\n    ")
+        print(
+            f"{name}: {numbers}, {outcome.memory / 2**20:.1f}, {len(outcome.faults)}",
+            *outcome.faults[:20],
+            sep="\n    ",
+            flush=True,
+        )
+
+    result = findings(sys.argv[3:] or known, int(sys.argv[1]), seed, os.cpu_count() or 1, report)
     sys.exit(any(outcome.faults for outcome in result.values()))
