@@ -389,6 +389,11 @@ def test_slices_that_are_no_volume(tmp_path):
     (tmp_path / "a2.png").unlink()
     save("a2.bmp", stack(4, 5, dtype="u1"))
     fails("several kinds.*a1.png.*a2.bmp", tmp_path)
+    (tmp_path / "a1.png").unlink()
+    whole = (tmp_path / "a2.bmp").read_bytes()
+    (tmp_path / "a2.bmp").write_bytes(whole[:18] + (8000).to_bytes(4, "little") * 2 + whole[26:])
+    with pytest.raises(VolumeError, match=r"a2.bmp: the header announces 8000 x 8000 voxels"):
+        read_volume(tmp_path)
 
 
 # --- Command line, configuration, packages ---------------------------------------------------------------------------
