@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
-from jvr.io.volumes import VolumeError, apart
+from jvr.io.volumes import VolumeError, apart, read_volume
 
 
 @pytest.mark.parametrize(
@@ -36,3 +37,12 @@ def test_what_a_decoder_says(tmp_path, monkeypatch):
     monkeypatch.setattr(apart, "SCRIPT", tmp_path / "decode.py")
     found = apart.decoded(Path("a"), {}, 1 << 20, [bytes(1 << 19), bytes([7]) * (1 << 19)])
     np.testing.assert_array_equal(found, np.repeat(np.array([7, 0], np.uint8), 1 << 19))
+
+
+def test_lzw_pages_of_a_tiff_are_decoded_apart(tmp_path, monkeypatch):
+    tifffile.imwrite(tmp_path / "a.tif", np.arange(60, dtype="u2").reshape(3, 4, 5), compression="lzw", photometric="minisblack")
+    assert read_volume(tmp_path / "a.tif", spacing=1).shape == (5, 4, 3)
+    (tmp_path / "decode.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)")
+    monkeypatch.setattr(apart, "SCRIPT", tmp_path / "decode.py")
+    with pytest.raises(VolumeError, match="status -11"):
+        read_volume(tmp_path / "a.tif", spacing=1)

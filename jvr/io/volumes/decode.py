@@ -11,13 +11,13 @@ from typing import Any
 
 # What a decoder may take beside the interpreter: JPEG 2000 works on 32-bit coefficients and their copies. Several threads of Zarr
 # have a chunk each, packed and unpacked, and an arena of the allocator.
-BASE, PER_BYTE = {"streams": 1 << 26, "zarr": 1 << 30}, {"streams": 24, "zarr": 4}
+BASE, PER_BYTE = {"streams": 1 << 26, "zarr": 1 << 30, "tiff": 1 << 28}, {"streams": 24, "zarr": 4, "tiff": 4}
 
 
 def main() -> None:
     """Does the task of standard input; ends with a message on standard error and status 1 where it cannot."""
     task = json.loads(sys.stdin.buffer.readline())
-    {"streams": _streams, "zarr": _zarr}[task["kind"]](task)
+    {"streams": _streams, "zarr": _zarr, "tiff": _tiff}[task["kind"]](task)
 
 
 def _streams(task: dict) -> None:
@@ -59,6 +59,28 @@ def _zarr(task: dict) -> None:
     if list(values.shape) != task["shape"]:
         sys.exit(f"the chunks are of shape {values.shape}, the array of {task['shape']}")
     sys.stdout.buffer.write(np.ascontiguousarray(values, task["dtype"]).view("u1").data)
+
+
+def _tiff(task: dict) -> None:
+    """All pages of an image: `file`, and `series`, its number there."""
+    import logging
+
+    import numpy as np
+    import tifffile
+
+    messages, handler = [], logging.Handler(logging.ERROR)
+    handler.emit = lambda record: messages.append(record.getMessage())
+    logging.getLogger("tifffile").addHandler(handler)
+    _limit(task)
+    try:
+        with tifffile.TiffFile(task["file"]) as file:
+            values = file.series[task["series"]].asarray(maxworkers=1)
+    except (Exception, MemoryError) as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+    # A damaged page is logged, and read as if it were black.
+    if damage := [message for message in messages if "GDAL_NODATA" not in message]:
+        sys.exit(damage[0])
+    sys.stdout.buffer.write(np.ascontiguousarray(values).view("u1").data)
 
 
 def _whole(data: Any) -> Any:
