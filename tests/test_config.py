@@ -320,3 +320,22 @@ def test_a_transfer_file_that_is_wrong_is_one_line(text, hint, tmp_path):
         read_transfer(tmp_path / "t.toml")
     assert str(caught.value).startswith(str(tmp_path / "t.toml"))
     assert hint in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a = " + "9" * 5000, "not valid TOML"),
+        ("a = " + "[" * 5000, "not valid TOML"),
+        (f"[settings]\nstep = {10**400}", "finite number"),
+        ("[camera]\nwidth = 0x" + "f" * 5000, "camera.width.*whole number from 1 to 65536.*thousands of digits"),
+        ("[camera]\nwidth = 99999999999", "whole number from 1 to 65536"),
+        (BASE.replace('builtin = "demo"', "path = '~no-such-user/a.nii'"), "does not exist|is not in"),
+    ],
+    ids=["digits", "brackets", "float", "hexadecimal", "pixels", "home"],
+)
+def test_numbers_and_nesting_without_bound(tmp_path, text, said):
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(ConfigError, match=said) as caught:
+        build_scene(read_config(tmp_path / "a.toml"))
+    assert "\n" not in str(caught.value)

@@ -1,8 +1,6 @@
 """DICOM: every pixel where its own frame says it is, and one line for each file that holds no volume. pydicom writes the files."""
 
 import copy
-import subprocess
-import sys
 import warnings
 
 import highdicom
@@ -350,7 +348,7 @@ def test_compressed_pixels(tmp_path, kind):
     stream[40:80] = bytes(40)
     dataset.PixelData = bytes(stream)
     saved(dataset, tmp_path / "b.dcm", pydicom.uid.UID("1.2.840.10008.1.2.4." + kind))
-    fails("compressed pixels are damaged", tmp_path / "b.dcm")
+    fails("compressed data are damaged", tmp_path / "b.dcm")
 
 
 def test_a_codestream_that_is_larger_than_its_header_says(tmp_path):
@@ -361,7 +359,7 @@ def test_a_codestream_that_is_larger_than_its_header_says(tmp_path):
         stream[size + at : size + at + 8] = (30000).to_bytes(4, "big") * 2
     dataset = picture(np.zeros((24, 32), "u2"), PixelData=encapsulate([bytes(stream)]))
     dataset["PixelData"].is_undefined_length = True
-    fails("compressed pixels are damaged", saved(dataset, tmp_path / "a.dcm", pydicom.uid.JPEG2000Lossless))
+    fails("compressed data are damaged", saved(dataset, tmp_path / "a.dcm", pydicom.uid.JPEG2000Lossless))
 
 
 def test_run_lengths(tmp_path):
@@ -487,61 +485,3 @@ def test_a_header_that_announces_more_than_there_is(tmp_path):
     nesting = b"\x08\x00\x40\x11SQ\x00\x00\xff\xff\xff\xff" + b"\xfe\xff\x00\xe0\xff\xff\xff\xff"
     (tmp_path / "d.dcm").write_bytes(content[:132] + content[132:350] + nesting * 5000)
     fails("d.dcm", tmp_path / "d.dcm")
-
-
-FUZZ = """
-import resource, sys, time, warnings, pathlib, numpy as np
-from jvr.io.volumes.dicom import read_dicom_file
-from jvr.io.volumes.errors import VolumeError
-from jvr.io.volumes.given import Given
-import pydicom, pydicom.pixels
-warnings.simplefilter("ignore")
-folder, count, seed = pathlib.Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-rng, slowest, read = np.random.default_rng(seed), 0.0, 0
-seeds = [file.read_bytes() for file in sorted(folder.glob("seed*"))]
-[read_dicom_file(file, Given(channel=None)) for file in sorted(folder.glob("seed*"))]
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-for k in range(count):
-    content = bytearray(seeds[k % len(seeds)])
-    for _ in range(rng.integers(1, 6)):
-        at = int(rng.integers(0, len(content)))
-        action = rng.integers(0, 5)
-        if action == 0: content[at] = rng.integers(0, 256)
-        elif action == 1: content[at:at + 4] = b"\\xff\\xff\\xff\\xff"
-        elif action == 2: del content[at:at + int(rng.integers(1, 40))]
-        elif action == 3: content[at:at] = bytes(content[int(rng.integers(0, len(content))):][:int(rng.integers(1, 60))])
-        else: content[at] ^= 1 << int(rng.integers(0, 8))
-        content = content or bytearray(b"x")
-    path = folder / "mutated.dcm"
-    path.write_bytes(content)
-    start = time.process_time()
-    try:
-        read_dicom_file(path, Given()); read += 1
-    except (VolumeError, OSError) as error:
-        assert "\\n" not in str(error)
-    except BaseException as error:
-        (folder / "bad.dcm").write_bytes(content)
-        raise
-    slowest = max(slowest, time.process_time() - start)
-grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-print(read, slowest, grown)
-assert slowest < 2 and grown < 300_000, (slowest, grown)
-"""
-
-
-def _fuzzed(folder, count, seed):
-    saved(picture(voxels()[:, :, 0].T.copy()), folder / "seed0.dcm")
-    saved(enhanced(voxels(), order=[2, 0, 1]), folder / "seed1.dcm", ImplicitVRLittleEndian)
-    saved(picture(voxels()[:, :, 0].T.copy()), folder / "seed2.dcm", pydicom.uid.DeflatedExplicitVRLittleEndian)
-    dataset = enhanced(voxels())
-    dataset.file_meta = FileMetaDataset()
-    dataset.compress(pydicom.uid.RLELossless, np.ascontiguousarray(voxels().T))
-    saved(dataset, folder / "seed3.dcm", pydicom.uid.RLELossless)
-    command = [sys.executable, "-c", FUZZ, str(folder), str(count), str(seed)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
-
-
-def test_no_mutation_does_harm(tmp_path):
-    result = _fuzzed(tmp_path, 300, 7)
-    assert result.returncode == 0, result.stderr[-2000:]
-    assert int(result.stdout.split()[0]) > 10

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jvr
+from jvr.model import voxels
 from jvr.model.voxels import typical_range
 
 N = 9
@@ -224,3 +225,15 @@ def test_a_volume_takes_what_numpy_holds(kind):
 def test_a_volume_says_what_single_precision_loses():
     with pytest.warns(UserWarning, match="float32 resolves only"):
         jvr.Volume(np.linspace(0, 1, 27).reshape(3, 3, 3) + 1e9)
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+def test_gaps_are_filled_by_slabs_as_at_once(monkeypatch, dtype):
+    rng = np.random.default_rng(0)
+    values = rng.integers(1, 200, (13, 5, 4)).astype(dtype)
+    values[rng.random(values.shape) < 0.6] = 0
+    values[4:9] = 0
+    whole = jvr.Volume(values, missing=0)
+    for slab in (1, 50):
+        monkeypatch.setattr(voxels, "SLAB", slab)
+        np.testing.assert_array_equal(jvr.Volume(values, missing=0).values, whole.values)

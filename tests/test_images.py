@@ -305,6 +305,25 @@ def test_any_failure_keeps_the_old_file(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
+def test_what_frames_or_tiles_a_picture_is_checked_before_it_is_decoded(tmp_path, monkeypatch):
+    """The library takes memory for the whole of a tile, and a frame is filled with black."""
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 64
+    planes = {name: np.ones((8, 16), np.float32) for name in "RGB"}
+    path = tmp_path / "a.exr"
+    OpenEXR.File({"type": OpenEXR.tiledimage, "tiles": tiles}, dict(planes)).write(str(path))
+    assert read_image(path).shape == (8, 16, 3)
+    whole, sizes = path.read_bytes(), np.array([64, 64], "<u4").tobytes()
+    assert whole.count(sizes) == 1
+    path.write_bytes(whole.replace(sizes, np.array([20000, 20000], "<u4").tobytes()))
+    fails("tiles of 20,000 x 20,000", read_image, path)
+    corner = np.array([0, 0, 15, 7], "<i4").tobytes()
+    at = whole.index(b"displayWindow")
+    path.write_bytes(whole[:at] + whole[at:].replace(corner, np.array([0, 0, 19999, 19999], "<i4").tobytes(), 1))
+    monkeypatch.setattr("jvr.io.image_sizes.available_memory", lambda: 4_000_000_000)
+    fails("4,800,000,000 bytes of pixels exceed the 4,000,000,000", read_image, path)
+
+
 def test_reading_png_needs_no_openexr():
     """Importing the module and reading a PNG leave OpenEXR and ITK alone."""
     buffer = io.BytesIO()

@@ -3,6 +3,7 @@
 import json
 import warnings
 
+import numcodecs
 import numpy as np
 import pint
 import pytest
@@ -332,6 +333,19 @@ def test_plain_zarr_names_no_data_zip_and_codecs(tmp_path):
         fails("'pickle'", path, axes="czyx", channel=1)
 
 
+def test_chunks_that_crash_a_decoder_or_announce_too_much(tmp_path):
+    """The decoder of Blosc reads beyond the end of a chunk that is cut short, which ends its process."""
+    path, values = tmp_path / "a.zarr", stack(3, 4, 5)
+    blosc = numcodecs.Blosc(cname="lz4")
+    zarr.create_array(path, shape=values.shape, dtype=values.dtype, zarr_format=2, compressors=blosc)[...] = values
+    np.testing.assert_array_equal(silent(path).values, values)
+    chunk = path / "0.0.0"
+    whole = chunk.read_bytes()
+    for damaged in (whole[:24], whole[:4] + (2**31 - 257).to_bytes(4, "little") + whole[8:]):
+        chunk.write_bytes(damaged)
+        fails("compressed data are damaged", path)
+
+
 # --- Folders of pictures ---------------------------------------------------------------------------------------------
 
 
@@ -375,6 +389,11 @@ def test_slices_that_are_no_volume(tmp_path):
     (tmp_path / "a2.png").unlink()
     save("a2.bmp", stack(4, 5, dtype="u1"))
     fails("several kinds.*a1.png.*a2.bmp", tmp_path)
+    (tmp_path / "a1.png").unlink()
+    whole = (tmp_path / "a2.bmp").read_bytes()
+    (tmp_path / "a2.bmp").write_bytes(whole[:18] + (8000).to_bytes(4, "little") * 2 + whole[26:])
+    with pytest.raises(VolumeError, match=r"a2.bmp: the header announces 8000 x 8000 voxels"):
+        read_volume(tmp_path)
 
 
 # --- Command line, configuration, packages ---------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """What the headers of pictures announce, looked at before a library sees the file: too many pixels, and parts that lie outside of it."""
 
+import math
 import re
 import struct
 from pathlib import Path
@@ -8,15 +9,18 @@ from typing import Any
 import numpy as np
 
 from jvr.io.volumes.errors import available_memory
-from jvr.pictures import ImageError
+from jvr.pictures import ImageError, quiet
 
-# Bytes of pixels that a byte of the file may stand for, at most: deflate and JPEG about 1000, a wavelet of a black picture more.
-TIGHTEST = {"png": 1100, "jpeg": 1100, "radiance": 64, "exr": 10_000}
+# Bytes of pixels that a byte of the file may stand for, at most: deflate and JPEG about 1000, a wavelet of a black picture more; the black
+# frame of a cropped picture takes no byte.
+TIGHTEST = {"png": 1100, "jpeg": 1100, "radiance": 64, "exr": 10_000, "frame": math.inf}
 # Rows of a block, by OpenEXR's number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB.
 ROWS = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
 TILED, DEEP, SEVERAL = 0x200, 0x800, 0x1000
 MOST_HEADER = 1 << 22
 LARGEST = 1 << 20
+# Pixels of a tile that may be larger than its picture: decoders take memory for all of them.
+LARGEST_TILE = 1 << 18
 
 
 def check_pixels(path: Path, kind: str, width: int, height: int, bytes_each: float | int) -> None:
@@ -84,10 +88,11 @@ def _check_part(path: Path, fields: dict[str, bytes]) -> None:
         raise _damaged(path, "it has no compression or channels")
     width, height = windows["dataWindow"]
     check_pixels(path, "exr", width, height, _bytes_each(path, fields["channels"]))
-    # A cropped picture may be far smaller than what it is framed by.
+    columns, rows = struct.unpack("<2I", fields.get("tiles", bytes(8))[:8].ljust(8, b"\0"))
+    if columns * rows > 4 * width * height + LARGEST_TILE:
+        raise _damaged(path, f"its tiles of {columns:,} x {rows:,} pixels are larger than the image")
     width, height = windows["displayWindow"]
-    if not (0 < width <= LARGEST and 0 < height <= LARGEST) or width * height > 2**30:
-        raise _damaged(path, f"its displayWindow has {width:,} x {height:,} pixels")
+    check_pixels(path, "frame", width, height, 12)
 
 
 def _bytes_each(path: Path, channels: bytes) -> int:
@@ -128,8 +133,10 @@ def sixteen_bits(path: Path) -> Any:
 
     wishes = OpenImageIO.ImageSpec()
     wishes.attribute("oiio:UnassociatedAlpha", 1)
-    file = OpenImageIO.ImageInput.open(str(path), wishes)
-    pixels = None if file is None else file.read_image(OpenImageIO.UINT16)
+    # libpng writes on the terminal what it finds.
+    with quiet():
+        file = OpenImageIO.ImageInput.open(str(path), wishes)
+        pixels = None if file is None else file.read_image(OpenImageIO.UINT16)
     if pixels is None:
         raise ValueError(OpenImageIO.geterror() or "no pixels")
     return pixels / 65535.0

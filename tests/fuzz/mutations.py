@@ -1,4 +1,4 @@
-"""Damaged files: each is a whole one with a few changes, the same ones for the same seed."""
+"""Damaged files: each is a whole one with a few changes, the same ones for the same seed; one of several may be lost or renamed."""
 
 import re
 
@@ -29,7 +29,33 @@ EXTREMES += [
     b"/dev/zero",
     b"(",
 ]
+# What a name may be in place of its own, which takes the place of the word.
+NAMES = ["{}~", ".{}", "{}.gz", "{}\n", "{}\udcff", " {}", "é{}", "-{}", "{}%d", "a" * 200 + "{}", "99999999999999999999{}"]
 WHOLE = [0, 1, -1, 127, 128, 255, 32767, -32768, 65535, 2**31 - 1, -(2**31), 2**31, 2**32 - 1, 2**62, 5000, 70000]
+
+
+def damaged(files: dict[str, bytes], rng: np.random.Generator) -> dict[str, bytes]:
+    """Files by their paths, of which one is damaged, or, where there are several, lost or renamed; the first ones most often."""
+    names = list(files)
+    chosen = names[(int(rng.geometric(0.5)) - 1) % len(names)]
+    what = rng.random() if len(files) > 1 else 1.0
+    if what < 0.05:
+        return {name: content for name, content in files.items() if name != chosen}
+    if what < 0.15:
+        return _renamed(files, chosen, rng)
+    return files | {chosen: mutated(files[chosen], rng)}
+
+
+def _renamed(files: dict[str, bytes], chosen: str, rng: np.random.Generator) -> dict[str, bytes]:
+    """One file with another name, or that of another one, with which it changes places."""
+    names = list(files)
+    if rng.random() < 0.5:
+        other = names[int(rng.integers(len(names)))]
+        return files | {chosen: files[other], other: files[chosen]}
+    folder, slash, last = chosen.rpartition("/")
+    name = NAMES[int(rng.integers(len(NAMES)))].format(last) if rng.random() < 0.7 else re.sub(r"\d+", "7", last.swapcase())
+    rest = {path: content for path, content in files.items() if path != chosen}
+    return rest | {f"{folder}{slash}{name}": files[chosen]}
 
 
 def mutated(content: bytes, rng: np.random.Generator) -> bytes:

@@ -48,13 +48,18 @@ def whole(what: str, low: int, high: int | None = None) -> BeforeValidator:
 def _number(value: Any, what: str, low: float, high: float, inner: bool, entry: str = "") -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise problem(f"{entry}must be a plain number ({what}), not {shown(value)}")
+    try:
+        value = float(value)
+    # A whole number beyond all that float64 holds.
+    except OverflowError:
+        value = math.inf
     if not math.isfinite(value):
         raise problem(f"{entry}must be a finite number ({what}), not {value}")
     if value < low or (inner and value == low):
         raise problem(f"{entry}must be {'above' if inner else 'at least'} {low:g} ({what}), not {value:g}")
     if value > high or (inner and value == high):
         raise problem(f"{entry}must be {'below' if inner else 'at most'} {high:g} ({what}), not {value:g}")
-    return float(value)
+    return value
 
 
 def increasing(value: list[float]) -> list[float]:

@@ -99,7 +99,11 @@ def shown(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, dict):
         return "a table"
-    text = str(value)
+    try:
+        text = str(value)
+    # Python refuses to write numbers of thousands of digits.
+    except ValueError:
+        return "a number of thousands of digits"
     return text if len(text) <= 60 else text[:57] + "..."
 
 

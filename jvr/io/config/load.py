@@ -44,7 +44,8 @@ class Config:
 
         **Raises** `ConfigError` where there is no such file; `what` says which data set it is.
         """
-        given = Path(path).expanduser()
+        # Unlike the method of Path, this leaves "~name" as it is where there is no such user.
+        given = Path(os.path.expanduser(path))
         data = Path(os.environ.get("JVR_DATA", "data"))
         here = [Path()] if self.where(key) == "--set" else []
         folders = [Path()] if given.is_absolute() else [*here, self.folder, data]
@@ -70,7 +71,8 @@ def read_config(path: str | os.PathLike, overrides: Sequence[str] = ()) -> Confi
     try:
         text = path.read_text(encoding="utf-8")
         data = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    # Numbers of thousands of digits and thousands of nested brackets raise errors of their own.
+    except (ValueError, RecursionError) as error:
         raise ConfigError(str(path), "", f"not valid TOML: {error}") from None
     return dataclasses.replace(config_from(data, str(path), path.parent, overrides), text=text)
 
@@ -130,7 +132,7 @@ def _parse(text: str) -> Override:
         raise ConfigError("--set", "", f"'{text}' must be key=value, such as settings.step=0.5")
     try:
         parsed = tomllib.loads(f"value = {value}")
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return key, value
     return key, parsed["value"] if list(parsed) == ["value"] else value
 

@@ -70,7 +70,8 @@ def read_transfer(path: str | os.PathLike) -> AbstractTransfer:
     name = str(path)
     try:
         data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    # Numbers of thousands of digits and thousands of nested brackets raise errors of their own.
+    except (ValueError, RecursionError) as error:
         raise ConfigError(name, "", f"not valid TOML: {error}") from None
     try:
         table = TypeAdapter(TransferTable).validate_python(data)

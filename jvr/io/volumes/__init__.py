@@ -191,7 +191,8 @@ def _path(path: Any) -> Path:
         raise VolumeError(name, "this is an address, and only files are read: download it")
     if not name or "\0" in name:
         raise VolumeError(repr(name), "this is no name of a file")
-    return Path(name).expanduser()
+    # Unlike the method of Path, this leaves "~name" as it is where there is no such user.
+    return Path(os.path.expanduser(name))
 
 
 def _three(path: Path, name: str, numbers: Any, *, positive: bool) -> np.ndarray | None:

@@ -110,6 +110,8 @@ def _slice(file: Path) -> np.ndarray:
         with warnings.catch_warnings(), Image.open(file, formats=[KINDS[file.suffix.lower()]]) as picture:
             warnings.simplefilter("ignore")
             check_size(file, picture.size, 4, None)
+            # A byte is eight pixels at most, before it is compressed.
+            check_size(file, picture.size, 1, 8 * file.stat().st_size, compressed=True)
             return _grey(file, ImageOps.exif_transpose(picture)).T
     except VolumeError:
         raise

@@ -4,12 +4,13 @@ import dataclasses
 import math
 import warnings
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jvr.io.volumes.apart import decoded
 from jvr.io.volumes.arrays import axes_of
 from jvr.io.volumes.axes import NAMES, Chosen, chosen, named
 from jvr.io.volumes.errors import VolumeError, check_size, first_bytes, missing_extra, one_line
@@ -18,6 +19,12 @@ from jvr.io.volumes.stored import Stored, affine_of
 from jvr.io.volumes.units import millimetres
 
 MARKERS = ("zarr.json", ".zarray", ".zgroup")
+# What turns bytes into numbers and no more; others may hold Python objects, the unpickling of which runs whatever they say.
+CODECS = {"bytes", "transpose", "sharding_indexed", "zlib", "gzip", "bz2", "lzma", "blosc", "zstd", "lz4", "shuffle", "delta"}
+CODECS |= {"packbits", "fixedscaleoffset", "quantize", "bitround", "astype"}
+CODECS |= {"crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"}
+# Of these, those that only arrange bytes.
+PLAIN = {"bytes", "transpose"}
 # Before OME-Zarr 0.3, which names its axes.
 OLD_AXES = ("t", "c", "z", "y", "x")
 
@@ -66,11 +73,13 @@ def read_zarr(path: Path, given: Given) -> Stored:
     except Exception as error:
         raise VolumeError(path, f"the metadata of this Zarr are damaged: {one_line(error)}") from None
     place = chosen(path, found.shape, names, given, level.channels if level else ())
-    _check(path, found, place)
     try:
-        values = place.of(found)
+        coded = _check(path, found, place)
+        values = _apart(path, found, place) if coded else place.of(found)
+    except VolumeError:
+        raise
     except Exception as error:
-        raise VolumeError(path, f"a chunk of the array is damaged: {one_line(error)}") from None
+        raise VolumeError(path, f"a chunk of the array is damaged: {one_line(error)}; copy it again") from None
     return Stored(values, _affine(path, level, place, given), missing=_missing(found))
 
 
@@ -206,10 +215,25 @@ def _names(path: Path, found: Any, level: Level | None, given: Given) -> Sequenc
     return [str(name) for name in names]
 
 
-def _check(path: Path, found: Any, place: Chosen) -> None:
-    """Refuses what is no array of numbers, holds no data or does not fit in memory, before a chunk is decoded."""
+def _apart(path: Path, found: Any, place: Chosen) -> np.ndarray:
+    """The chosen volume, from a process of its own: its decoders, native code, crash on damaged chunks."""
+    shape = [n for n, one in zip(found.shape, place.index, strict=True) if isinstance(one, slice)]
+    count = math.prod(shape) * found.dtype.itemsize
+    task = {"kind": "zarr", "store": str(path), "array": found.path, "dtype": found.dtype.str, "shape": shape}
+    task["index"] = [None if isinstance(one, slice) else one for one in place.index]
+    task["bytes"] = max(count, 8 * math.prod(found.chunks) * found.dtype.itemsize)
+    return place.arranged(decoded(path, task, count).view(found.dtype).reshape(shape))
+
+
+def _check(path: Path, found: Any, place: Chosen) -> bool:
+    """Refuses what is no array of numbers, holds no data or does not fit in memory, before a chunk is decoded: says whether one must be."""
     if found.dtype.kind not in "biufc":
         raise VolumeError(path, f"the array holds {found.dtype}, not numbers; save it as real numbers")
+    metadata = found.metadata.to_dict()
+    parts = [metadata.get(name) for name in ("codecs", "filters", "compressor")]
+    coded = set(_codecs(parts)) - PLAIN
+    if foreign := [name for name in coded if name.removeprefix("numcodecs.") not in CODECS]:
+        raise VolumeError(path, f"its chunks are coded by '{foreign[0]}', which is not read: save it with zstd, blosc or zlib")
     shape = [n for n, one in zip(found.shape, place.index, strict=True) if isinstance(one, slice)]
     check_size(path, shape, found.dtype.itemsize, None)
     if math.prod(found.chunks) * found.dtype.itemsize > 4 * math.prod(found.shape) * found.dtype.itemsize + 2**26:
@@ -223,6 +247,18 @@ def _check(path: Path, found: Any, place: Chosen) -> None:
             files = [name.rsplit("/", 1)[-1] for name in archive.namelist() if name.startswith(found.path)]
     if found.size == 0 or all(name in (*MARKERS, ".zattrs", ".zmetadata", "") for name in files):
         raise VolumeError(path, f"the array of shape {found.shape} holds no data: copy it again with its chunks")
+    return bool(coded)
+
+
+def _codecs(parts: Any) -> Iterator[str]:
+    """Names of codecs, and of those within others."""
+    if isinstance(parts, dict):
+        if "id" in parts or "name" in parts:
+            yield str(parts.get("id") or parts.get("name"))
+        parts = list(parts.values())
+    if isinstance(parts, list | tuple):
+        for part in parts:
+            yield from _codecs(part)
 
 
 def _affine(path: Path, level: Level | None, place: Chosen, given: Given) -> np.ndarray:

@@ -25,7 +25,7 @@ Positions = Annotated[list[float], numbers(None, "in the data's own units"), Aft
 Range = Annotated[list[float], numbers(2, "low, high in the data's own units"), AfterValidator(increasing)]
 Extinctions = Annotated[list[Any], numbers_or_triples("extinction per mm", 0.0)]
 Extinction = Annotated[float, number("extinction per mm", 0.0)]
-Pixels = Annotated[int, whole("pixels", 1)]
+Pixels = Annotated[int, whole("pixels", 1, 65_536)]
 Angle = Annotated[float, number("full vertical angle in degrees", 0.0, 180.0, inner=True)]
 Steepness = Annotated[float, number("length of a gradient, data units per mm", 0.0)]
 

@@ -88,7 +88,7 @@ class SampledTable(OfScalarTable):
     """A `jvr.LutTransfer` with extinction summed from parts and colours blended smoothly between a few."""
 
     kind: Literal["sampled"]
-    entries: Annotated[int, whole("entries of the table", 2)]
+    entries: Annotated[int, whole("entries of the table", 2, 65_536)]
     domain: Range
     positions: Positions
     rgb: list[Colour]

@@ -94,7 +94,7 @@ class RigTable(CameraTable):
     """Several cameras around the target: `jvr.fibonacci_sphere` or `jvr.orbit`."""
 
     kind: Literal["fibonacci", "orbit"]
-    count: Annotated[int, whole("cameras", 1)]
+    count: Annotated[int, whole("cameras", 1, 10_000)]
     radius: Length | None = None
     fov_y: Angle | None = None
     half_angle_tangent: Annotated[float, number("tangent of half the vertical angle", 0.0, inner=True)] | None = None
@@ -162,7 +162,7 @@ class SettingsTable(Table):
 class StartTable(Table):
     """The table that a fit starts from: one grey and one extinction for every entry."""
 
-    entries: Annotated[int, whole("entries of the table", 2)] = 64
+    entries: Annotated[int, whole("entries of the table", 2, 65_536)] = 64
     grey: Annotated[float, number("linear radiance", 0.0, 1.0)] = 0.5
     opacity: Annotated[float, number("optical depth of one voxel", 0.0)] | None = None
     sigma_t: Extinction | None = None

@@ -4,20 +4,17 @@ Uncompressed and run-length coded pixels are read here; compressed ones go to a 
 """
 
 import importlib.util
-import json
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jvr.io.volumes.apart import decoded
 from jvr.io.volumes.dicom.frames import HARMLESS, Frame
 from jvr.io.volumes.dicom.geometry import Placed
 from jvr.io.volumes.dicom.headers import Header, guarded, parsed
-from jvr.io.volumes.errors import VolumeError, check_size, one_line
+from jvr.io.volumes.errors import VolumeError, check_size
 from jvr.io.volumes.given import Given
 from jvr.io.volumes.stored import Stored
 
@@ -271,11 +268,8 @@ def _syntax_name(header: Header) -> str:
 
 
 def _decoded(waiting: list[tuple[Frame, bytes]]) -> Iterator[tuple[Header, int, np.ndarray]]:
-    """Pictures of codestreams, from a process that may take a few times their announced size and a few seconds."""
-    total = sum(_frame_bytes(frame) for frame, _ in waiting)
-    # Decoders deliver 10 MB/s and more, on one core.
-    seconds = 2 + total // 2_000_000
-    tasks = [
+    """Pictures of codestreams, from a process of its own."""
+    frames = [
         {
             "codec": CODECS[frame.source.syntax.removeprefix(JPEG)],
             "bytes": len(stream),
@@ -285,25 +279,8 @@ def _decoded(waiting: list[tuple[Frame, bytes]]) -> Iterator[tuple[Header, int, 
         }
         for frame, stream in waiting
     ]
-    file = waiting[0][0].source.file
-    with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as found:
-        given.write(json.dumps({"seconds": seconds, "frames": tasks}).encode() + b"\n")
-        given.writelines(stream for _, stream in waiting)
-        given.seek(0)
-        command = [sys.executable, "-P", str(Path(__file__).with_name("decode.py"))]
-        try:
-            # The processor time is limited in the process; a busy machine may take longer.
-            result = subprocess.run(
-                command, stdin=given, stdout=found, stderr=subprocess.PIPE, timeout=10 + 10 * seconds, check=False
-            )
-            problem = one_line(result.stderr.decode("utf-8", "replace").strip()[-240:]) if result.returncode else ""
-        except subprocess.TimeoutExpired:
-            problem = "the decoder does not end"
-        if problem:
-            raise VolumeError(file, f"its compressed pixels are damaged or not supported: {problem}")
-        found.seek(0)
-        for frame, _ in waiting:
-            pixels = np.fromfile(found, f"u{max(frame.source.whole('BitsAllocated') // 8, 1)}", frame.size[0] * frame.size[1])
-            if pixels.size < frame.size[0] * frame.size[1]:
-                raise VolumeError(frame.source.file, "its compressed pixels are damaged: copy it again")
-            yield frame.source, frame.index, pixels.reshape(frame.size[1], frame.size[0])
+    sizes = [task["rows"] * task["columns"] * task["itemsize"] for task in frames]
+    task = {"kind": "streams", "frames": frames, "bytes": max(sizes)}
+    found = decoded(waiting[0][0].source.file, task, sum(sizes), (stream for _, stream in waiting))
+    for (frame, _), task, part in zip(waiting, frames, np.split(found, np.cumsum(sizes)[:-1]), strict=True):
+        yield frame.source, frame.index, part.view(f"u{task['itemsize']}").reshape(task["rows"], task["columns"])

@@ -1,0 +1,76 @@
+"""Reflectance, configurations, transfer functions and the checkpoints of fits."""
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from seeds.seed import SHAPE, Seed, voxels
+
+TRANSFERS = {
+    "linear": 'kind = "linear"\npositions = [0, 1, 2]\nrgb = [[0, 0, 0], [1, 1, 1], [1, 0.5, 0]]\nsigma_t = [0, 1, 2]\n',
+    "lut": 'kind = "lut"\ndomain = [0, 1]\nrgb = [[0, 0, 0], [1, 1, 1]]\nsigma_t = [0, 1]\ngradient_opacity = { low = 1, high = 2 }\n',
+    "gaussian": 'kind = "gaussian"\ncenter = [0.5, 1]\nwidth = [0.1, 0.2]\nheight = [1, 2]\nrgb = [[1, 0, 0], [0, 1, 0]]\n',
+    "window": 'kind = "window"\nwindow = 400\nlevel = 40\nsigma_t = 0.5\nrgb = [1, 1, 0.9]\n',
+    "preset": 'kind = "preset"\npreset = "ct_bone"\n',
+    "sampled": 'kind = "sampled"\nentries = 32\ndomain = [0, 1]\npositions = [0, 1]\nrgb = [[0, 0, 0], [1, 1, 1]]\n'
+    'extinction = [\n{ kind = "ramp", between = [0.2, 0.4], height = 1 },\n'
+    '{ kind = "gaussian", center = 0.5, width = 0.1, height = 2 },\n]\n',
+    "gradient": 'kind = "gradient"\ndomain = [0, 1]\nmagnitudes = [1, 2]\nrgb = [[[0, 0, 0], [1, 1, 1]], [[0, 0, 0], [1, 0, 0]]]\n'
+    "sigma_t = [[0, 0], [1, 2]]\n",
+}
+SCENE = (
+    f'background = [0, 0, 0]\n[volume]\npath = "a.raw"\nshape = {list(SHAPE)}\ndtype = "<i2"\nspacing = [0.5, 1.25, 3]\nmissing = 0\n'
+    '[transfer]\nkind = "preset"\npreset = "ct_bone"\n[camera]\neye = [1, 2, 3]\nfov_y = 30\nwidth = 8\nheight = 8\n'
+    "[settings]\nstep = 0.5\n"
+)
+
+
+def tables(folder: Path) -> dict[str, Seed]:
+    from jvr.io.config import ConfigError, read_config, read_transfer
+
+    configs = Path(__file__).parents[3] / "configs"
+    seeds = {
+        f"config, {path.stem}": Seed({"a.toml": path.read_bytes()}, "a.toml", read_config, (ConfigError,))
+        for path in sorted(configs.glob("*.toml"))
+    }
+    files = {"a.toml": SCENE.encode(), "a.raw": voxels().tobytes(order="F")}
+    seeds["config, scene"] = _scene(files)
+    for kind, text in TRANSFERS.items():
+        seeds[f"transfer, {kind}"] = Seed({"a.toml": text.encode()}, "a.toml", read_transfer, (ConfigError,))
+    seeds["merl"] = _merl()
+    seeds["checkpoint"] = _checkpoint(folder)
+    return seeds
+
+
+def _scene(files: dict[str, bytes]) -> Seed:
+    """A configuration with its volume, up to the scene and the cameras."""
+    from jvr.io.config import ConfigError, read_config
+    from jvr.io.config.build import build_cameras, build_scene, build_settings
+    from jvr.io.volumes import VolumeError
+
+    def read(path: Path) -> Any:
+        config = read_config(path)
+        scene = build_scene(config)
+        return build_cameras(config, scene.volume, scene.transfer), build_settings(config)
+
+    return Seed(files, "a.toml", read, (ConfigError, VolumeError))
+
+
+def _merl() -> Seed:
+    from jvr.io import merl
+
+    # A whole table has 35 MB: damage does not need so many cells.
+    merl.CELLS = (3, 2, 4)
+    content = struct.pack("<3i", *merl.CELLS) + np.linspace(0, 900, 72).astype("<f8").tobytes()
+    return Seed({"a.binary": content}, "a.binary", merl.read_merl, (merl.MerlError,))
+
+
+def _checkpoint(folder: Path) -> Seed:
+    from jvr.fitting import checkpoint
+
+    state, fingerprint = {"x": np.arange(6.0), "k": np.array(3)}, {"camera": "abc"}
+    checkpoint.save(folder / "a.npz", state, [{"loss": 1.0}], fingerprint)
+    read = lambda path: checkpoint.load(path, state, fingerprint)
+    return Seed({"a.npz": (folder / "a.npz").read_bytes()}, "a.npz", read, (checkpoint.CheckpointError,))
