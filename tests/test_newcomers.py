@@ -531,6 +531,19 @@ def test_hot_voxels_do_not_move_an_automatic_window(hot):
     np.testing.assert_allclose(contents(jvr.Volume(corner_ball(hot))), contents(jvr.Volume(corner_ball(0))), atol=0.05)
 
 
+def test_names_that_are_no_text_are_printed(tmp_path):
+    with open(os.fsencode(tmp_path) + b"/\xff.npy", "wb") as file:
+        np.save(file, RAMP)
+    done = subprocess.run(
+        [sys.executable, "-c", "from jvr.cli import main; main()", "info", b"\xff.npy"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONIOENCODING": "utf-8:strict", "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert b"\udcff.npy" in done.stdout
+
+
 def test_what_is_up_is_said_by_what_a_file_holds_not_by_its_name(tmp_path):
     header = b"DimSize = 3 4 5\n%bElementType = MET_FLOAT\nElementDataFile = LOCAL\n"
     contents_of = {

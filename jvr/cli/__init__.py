@@ -3,6 +3,7 @@
 Nothing that takes time is imported before `run` can catch Ctrl-C.
 """
 
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -14,6 +15,9 @@ from jvr.cli.signals import INTERRUPTED, Terminated, catch, leave, said
 def main() -> NoReturn:
     """The entry point of the `jvr` command."""
     catch()
+    # Names of files may hold bytes that are no text, and terminals may know no bars.
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         status = run(sys.argv[1:])
         if sys.stdout is not None:  # closed by the caller
