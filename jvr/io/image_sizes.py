@@ -128,7 +128,7 @@ def _check_offsets(path: Path, fields: dict[str, bytes], content: bytes, positio
 
 
 def sixteen_bits(path: Path) -> Any:
-    """Codes 0 ... 1 of a PNG of 16 bits, as they are: its alpha is not multiplied with its colours."""
+    """Codes of a PNG of 16 bits, as they are: its alpha is not multiplied with its colours."""
     import OpenImageIO
 
     wishes = OpenImageIO.ImageSpec()
@@ -139,4 +139,4 @@ def sixteen_bits(path: Path) -> Any:
         pixels = None if file is None else file.read_image(OpenImageIO.UINT16)
     if pixels is None:
         raise ValueError(OpenImageIO.geterror() or "no pixels")
-    return pixels / 65535.0
+    return pixels

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32, Integer
 
 from jvr.io.image_sizes import check_exr, check_pixels, check_radiance, sixteen_bits
 from jvr.io.volumes.errors import SIGNATURES, first_bytes, one_line
@@ -182,15 +182,20 @@ def _read_srgb(path: Path, start: bytes) -> tuple[Pixels, Plane | None]:
         raise ImageError(path, f"the image is damaged or cut short ({one_line(error)}); copy or export it again") from error
     if code.ndim == 2:
         code = code[..., None]
+    # One number for each code: a picture takes no more memory on its way than at its end.
+    codes = np.arange(np.iinfo(code.dtype).max + 1) / np.iinfo(code.dtype).max
+    linear = linear_from_srgb(codes).astype(np.float32)
     has_alpha = code.shape[2] in (2, 4)
-    colour = linear_from_srgb(code[..., :-1] if has_alpha else code)
-    pixels = colour * code[..., -1:] if has_alpha else colour
-    picture = np.broadcast_to(pixels, (*pixels.shape[:2], 3)).astype(np.float32)
-    return picture, code[..., -1].astype(np.float32) if has_alpha else None
+    picture = linear[np.broadcast_to(code[..., :-1] if has_alpha else code, (*code.shape[:2], 3))]
+    if not has_alpha:
+        return picture, None
+    alpha = codes.astype(np.float32)[code[..., -1]]
+    picture *= alpha[..., None]
+    return picture, alpha
 
 
-def _eight_bits(path: Path) -> Float[np.ndarray, "..."]:
-    """Codes 0 ... 1 of everything but colour with 16 bits."""
+def _eight_bits(path: Path) -> Integer[np.ndarray, "..."]:
+    """Codes of everything but colour with 16 bits."""
     from PIL import Image, ImageOps
 
     # Of all that Pillow knows, some formats start other programs.
@@ -200,8 +205,8 @@ def _eight_bits(path: Path) -> Float[np.ndarray, "..."]:
             warnings.warn(f"{path}: {guess}", stacklevel=4)
         image = ImageOps.exif_transpose(image)
         if image.mode.startswith("I"):
-            return np.asarray(image).astype(np.float64) / 65535
-        return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB")) / 255.0
+            return np.asarray(image).astype(np.uint16)
+        return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
 
 
 def _guesses(image: Any) -> Iterator[str]:
