@@ -106,7 +106,7 @@ def snapshot(folder):
         ("render fit.toml -o kept.png --preset ct_bone", "--preset"),
         ("render volume.npy -o kept.png --preset ct_bones", "did you mean 'ct_bone'?"),
         ("render volume.npy -o kept.png --shape 6,7", "--shape"),
-        ("render kept.png -o kept.png", "unsupported extension"),
+        ("render kept.png -o kept.png", "one picture is no volume"),
         ("render fit.toml -o kept.png --set shadows=['rays','map']", "'rays' and 'map' exclude each other"),
         ("render fit.toml -o kept.png --set shadows=rays", "no light that casts them"),
         ("render fit.toml -o kept.png --set lights=haed", "did you mean 'head'?"),
@@ -338,14 +338,14 @@ def test_an_installed_wheel_has_the_demo(tmp_path):
 def test_the_compilation_cache_lies_in_the_users_cache_folder(tmp_path, monkeypatch):
     import jax
 
-    from jvr.cli.runtime import use_compilation_cache
+    from jvr.cli.runtime import start_jax
 
     monkeypatch.setenv("JVR_CACHE", "1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     before = jax.config.jax_compilation_cache_dir
     try:
-        use_compilation_cache()
+        start_jax()
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "cache" / "jvr" / "xla")
     finally:
         jax.config.update("jax_compilation_cache_dir", before)

@@ -128,7 +128,8 @@ def test_every_derivative_is_finite_and_missing_voxels_have_none(x64):
     missing = np.asarray(start.volume.gaps) & 1 > 0
     assert np.all(np.asarray(float_of.values)[missing] == 0)
     assert np.count_nonzero(float_of.values) > 100
-    h = 1e-6
+    # The objective is some hundred: differences over less have lost more digits than are compared.
+    h = 1e-5
     # Beside the hole, in a voxel that counts in whole cells and in half empty ones.
     for voxel in [(2, 3, 3), (5, 4, 4), (1, 2, 4)]:
         move = lambda d, voxel=voxel: eqx.tree_at(lambda v: v.values, start.volume, start.volume.values.at[voxel].add(d))

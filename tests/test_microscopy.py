@@ -417,11 +417,13 @@ def test_flags_and_configuration_keys_choose_channel_and_time(tmp_path, capsys):
     assert (float(volume.slope), float(volume.intercept)) == (2, 1)
 
 
-def test_what_to_install_where_a_decoder_is_missing(tmp_path, monkeypatch):
-    tifffile.imwrite(tmp_path / "a.tif", stack(3, 4, 5), compression="lzw", photometric="minisblack")
+@pytest.mark.parametrize("compression", ["lzw", "zstd"])
+def test_what_to_install_where_a_decoder_is_missing(tmp_path, monkeypatch, compression):
+    tifffile.imwrite(tmp_path / "a.tif", stack(3, 4, 5), compression=compression, photometric="minisblack")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
 
     def missing(*_, **__):
-        raise ValueError("<COMPRESSION.LZW: 5> requires the 'imagecodecs' package")
+        raise ValueError(f"<COMPRESSION.{compression.upper()}> requires the 'imagecodecs' package")
 
     monkeypatch.setattr(tifffile.TiffPageSeries, "asarray", missing)
     fails("pip install imagecodecs", tmp_path / "a.tif", spacing=1)

@@ -303,14 +303,15 @@ def test_fit_leaves_out_what_is_negligible(x64):
     ],
 )
 def test_empty_space_is_not_sampled(transfer):
-    """A ball in a large empty box: samples are taken near the ball only, and the picture is the same to 1e-6."""
+    """A ball in a large empty box: samples are taken near the ball only, and the picture is the same to 4e-6: two programs round
+    positions, which are up to 180 away from the eye, each in its own way."""
     grid = np.stack(np.meshgrid(*[np.arange(65.0) - 32] * 3, indexing="ij"))
     ball = np.clip(9 - np.sqrt((grid**2).sum(0)), 0, 1).astype(np.float32)
     volume = jvr.Volume(ball)
     camera = jvr.PerspectiveCamera.look_at((150.0, 90.0, 60.0), volume.center, (0, 0, 1), 20.0, 32, 32)
     on, off = (pictures(jvr.Scene(volume, transfer), camera, skipping) for skipping in (True, False))
     assert on.stats.steps.sum() < 0.2 * off.stats.steps.sum()
-    np.testing.assert_allclose(on.rgb, off.rgb, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(on.rgb, off.rgb, rtol=0, atol=4e-6)
 
 
 @pytest.mark.parametrize("size", [0, -1, True])

@@ -16,7 +16,10 @@ def start_jax() -> None:
     `JVR_CACHE=0` turns that off."""
     from jvr.execution.devices import use_all_cores
 
-    use_all_cores()
+    with warnings.catch_warnings():
+        # Where a command is called as a function JAX may have begun.
+        warnings.simplefilter("ignore")
+        use_all_cores()
     folder = None if "JAX_COMPILATION_CACHE_DIR" in os.environ else cache_folder("xla")
     if folder is None:
         return

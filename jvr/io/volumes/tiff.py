@@ -1,6 +1,7 @@
 """TIFF, read by tifffile: stacks of pages, ImageJ's hyperstacks and OME-TIFF, with the voxel sizes, channels and times they name."""
 
 import contextlib
+import importlib.util
 import logging
 import math
 import warnings
@@ -98,6 +99,8 @@ def _read(path: Path, file: Any, given: Given, messages: list[str]) -> Stored:
 
 def _apart(path: Path, number: int, series: Any) -> Any:
     """All pages, from a process of its own: the decoder of LZW, native code, crashes on damaged ones."""
+    if importlib.util.find_spec("imagecodecs") is None:
+        raise VolumeError(path, "its compression (LZW) needs the package imagecodecs: pip install imagecodecs")
     count = math.prod(series.shape) * series.dtype.itemsize
     task = {"kind": "tiff", "file": str(path), "series": number, "bytes": count}
     return decoded(path, task, count).view(series.dtype).reshape(series.shape)
