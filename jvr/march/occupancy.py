@@ -81,6 +81,25 @@ def occupancy_of(
 
     With a bound `least` on extinction, what is below it is not visible, and derivatives leap over it too.
     """
+    empty = lambda nearby: ~visible_bricks(bricks, slope, intercept, transfer, least, nearby=nearby)
+    if least is not None:
+        (reach,) = _reaches(empty(True))
+        return Occupancy(reach, None, bricks.size)
+    reach, reach_of_slopes = _reaches(empty(False), empty(True))
+    return Occupancy(reach, reach_of_slopes, bricks.size)
+
+
+def visible_bricks(
+    bricks: Bricks,
+    slope: Scalar,
+    intercept: Scalar,
+    transfer: AbstractTransfer,
+    least: Scalar | float | None = None,
+    *,
+    nearby: bool = False,
+) -> Bool[Array, "bx by bz"]:
+    """Bricks that a transfer function gives more extinction than `least`, by default none, somewhere between their bounds; `nearby`: also
+    those where it has a derivative in the scalar. Not differentiable."""
     slope, intercept, transfer = jax.lax.stop_gradient((slope, intercept, transfer))
     scaled = [slope * bound.astype(slope.dtype) for bound in (bricks.lower, bricks.upper)]
     ends = [end + intercept for end in scaled]
@@ -88,15 +107,8 @@ def occupancy_of(
     margin = 8 * jnp.finfo(slope.dtype).eps * (jnp.maximum(*map(jnp.abs, scaled)) + jnp.abs(intercept))
     low, high = jnp.minimum(*ends) - margin, jnp.maximum(*ends) + margin
 
-    def empty(nearby: bool) -> Bool[Array, "bx by bz"]:
-        is_visible = jax.vmap(lambda low, high: transfer.is_visible(low, high, 0.0 if least is None else least, nearby=nearby))
-        return ~(is_visible(low.ravel(), high.ravel()).reshape(low.shape) | jnp.isnan(low + high))
-
-    if least is not None:
-        (reach,) = _reaches(empty(nearby=True))
-        return Occupancy(reach, None, bricks.size)
-    reach, reach_of_slopes = _reaches(empty(nearby=False), empty(nearby=True))
-    return Occupancy(reach, reach_of_slopes, bricks.size)
+    is_visible = jax.vmap(lambda low, high: transfer.is_visible(low, high, 0.0 if least is None else least, nearby=nearby))
+    return is_visible(low.ravel(), high.ravel()).reshape(low.shape) | jnp.isnan(low + high)
 
 
 def _reaches(*empty: Bool[Array, "bx by bz"]) -> list[UInt8[Array, "bx by bz"]]:

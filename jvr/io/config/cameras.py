@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jvr.io.config.schema.whole import AnyCamera, OrthographicTable, PerspectiveTable, RigTable
-from jvr.march.occupancy import occupancy_of
+from jvr.march.occupancy import visible_bricks
 from jvr.model.bricks import bricks_of
 from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, fibonacci_sphere, orbit
 from jvr.model.exact import in_double
@@ -72,13 +72,13 @@ def _visible_corners(volume: Volume, transfer: AbstractTransfer) -> np.ndarray:
     """World positions of the corners of all visible bricks, `(n, 3)`."""
     bricks = volume.bricks if volume.bricks is not None else volume.bricked().bricks
     assert bricks is not None
-    reach = np.asarray(eqx.filter_jit(occupancy_of)(bricks, volume.slope, volume.intercept, transfer).reach)
+    visible = np.asarray(eqx.filter_jit(visible_bricks)(bricks, volume.slope, volume.intercept, transfer))
     if volume.gaps is not None:
-        reach = np.where(_without_data(volume, bricks.size), 1, reach)
-    first = np.argwhere(_without_specks(reach == 0))[:, None] * bricks.size
+        visible = visible & ~_without_data(volume, bricks.size)
+    first = np.argwhere(_without_specks(visible))[:, None] * bricks.size
     grid = first + np.array(list(itertools.product((0, bricks.size), repeat=3)))
     low, high = volume.domain
-    grid = np.unique(np.clip(grid.reshape(-1, 3), low, high), axis=0)
+    grid = np.clip(grid.reshape(-1, 3), low, high)
     matrix = in_double(volume.world_from_grid, volume.remainder)
     return grid @ matrix[:3, :3].T + matrix[:3, 3]
 
