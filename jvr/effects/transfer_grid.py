@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -66,9 +67,10 @@ def transfer_visibility(scene: Scene, medium: Medium, inner: AbstractVisibility 
         projected = scattered(scene, projected)
     coefficients, light = projected.coefficients, environment.coefficients
     if transfer.exact:
-        arriving = _products(coefficients, light, material.projected(scene.material_order).order)
+        order = material.projected(scene.material_order).order
+        arriving = _over_nodes(lambda light, nodes: _products(nodes, light, order), light, coefficients)
     else:
-        arriving = _shares(projected.facing, coefficients, light)
+        arriving = _over_nodes(lambda light, nodes: _shares(*nodes, light), light, (projected.facing, coefficients))
     if material.needs_gradient:
         arriving = jnp.concatenate([arriving, projected.solid[..., None]], axis=-1)
     shape = coefficients.shape[:3]
@@ -178,35 +180,48 @@ def scattered(scene: Scene, projected: ProjectedTransfer) -> ProjectedTransfer:
     return dataclasses.replace(projected, luminance=coefficients, chroma=None, scattered=True)
 
 
+def _over_nodes(
+    function: Callable[[Array, Any], Array], light: Float[Array, "others 3"], grids: Any
+) -> Float[Array, "x y z products"]:
+    """`function` of the light and what nodes hold, each device with its own share of them."""
+    x, y, z = jax.tree.leaves(grids)[0].shape[:3]
+    fill = -(x * y * z) % shares()
+
+    def flat(grid: Array) -> Array:
+        rows = grid.reshape(x * y * z, *grid.shape[3:])
+        return jnp.pad(rows, ((0, fill), *[(0, 0)] * (rows.ndim - 1))) if fill else rows
+
+    return over_rays(function, light, jax.tree.map(flat, grids))[: x * y * z].reshape(x, y, z, -1)
+
+
 def _shares(
-    facing: Float[Array, "x y z 3"], coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "others 3"]
-) -> Float[Array, "x y z 3"]:
+    facing: Float[Array, "nodes 3"], coefficients: Float[Array, "nodes channels bands"], light: Float[Array, "others 3"]
+) -> Float[Array, "nodes 3"]:
     """The share of each colour of the light that arrives, of all that a matte surface would reflect that faces where the node does; 0
     where there is no light."""
     matrix = product_matrix(light, math.isqrt(coefficients.shape[-1]) - 1, 2)
-    channels = coefficients.shape[3]
-    flat = [coefficients[..., c, :].reshape(-1, coefficients.shape[-1]).T for c in range(channels)]
-    normal, length = direction_and_length(tuple(facing.reshape(-1, 3).T))
+    flat = [coefficients[:, c].T for c in range(coefficients.shape[1])]
+    normal, length = direction_and_length(tuple(facing.T))
     # A cosine over pi: band l of its coefficients is A_l / pi Y_lm(n). Without a direction all count alike.
     kernel = [1.0, *(length * k for k in (2 / 3, 1 / 4))]
     functions = [y * kernel[band] for y, band in zip(basis(2, normal), band_of(2), strict=True)]
     full = jnp.pad(light, ((0, max(9 - light.shape[0], 0)), (0, 0)))[:9]
-    shares = []
+    found = []
     for colour in range(3):
         # Numbers of a node far from each other and those of all nodes side by side: one loop for all that follows.
-        arriving = matrix[..., colour] @ flat[colour % channels]
+        arriving = matrix[..., colour] @ flat[colour % len(flat)]
         own, whole = (sum(y * v[i] for i, y in enumerate(functions)) for v in (arriving, full[:, colour]))
         # Where a surface faces no light the share is that of all light.
         own, whole = (jnp.maximum(v, 0.0) + DARK * jnp.maximum(r[0], 0.0) for v, r in ((own, arriving), (whole, full[:, colour])))
-        shares.append(divide_or_zero(own, whole))
-    return jnp.stack(shares, axis=-1).reshape(*facing.shape[:3], 3)
+        found.append(divide_or_zero(own, whole))
+    return jnp.stack(found, axis=-1)
 
 
 def _products(
-    coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "others 3"], order: int
-) -> Float[Array, "x y z products"]:
+    coefficients: Float[Array, "nodes channels bands"], light: Float[Array, "others 3"], order: int
+) -> Float[Array, "nodes products"]:
     """Coefficients of light times transfer up to an order, all colours of each."""
     matrix = product_matrix(light, math.isqrt(coefficients.shape[-1]) - 1, order)
-    kinds = "xyzcb,obc->xyzoc" if coefficients.shape[3] == 3 else "xyzcb,obh->xyzoh"
+    kinds = "ncb,obc->noc" if coefficients.shape[1] == 3 else "ncb,obh->noh"
     products = jnp.einsum(kinds, coefficients, matrix)
-    return products.reshape(*products.shape[:3], -1)
+    return products.reshape(products.shape[0], -1)
