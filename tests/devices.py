@@ -61,9 +61,8 @@ def test_there_are_three():
     ("name", "size"),
     [
         ("plain", (15, 13)),
-        ("plain", (1, 1)),
-        ("shadow volume", (15, 13)),
-        *(pytest.param(name, (15, 13), marks=slow) for name in ("tiles", "refinement", "shadow rays", "deep map")),
+        pytest.param("plain", (1, 1), marks=slow),
+        *(pytest.param(name, (15, 13), marks=slow) for name in SCENES if name != "plain"),
     ],
 )
 def test_pictures(name, size):
@@ -89,7 +88,8 @@ def test_gradients_in_everything(name, by):
     close(gradient(arrays), on_one_device(gradient, arrays), 2e-4)
 
 
-@pytest.mark.parametrize("adjoint", [jvr.Forward(), pytest.param(jvr.Rows(), marks=slow)])
+@slow
+@pytest.mark.parametrize("adjoint", [jvr.Forward(), jvr.Rows()])
 def test_tangents(adjoint):
     scene, camera = plain(), perspective(plain().volume, 9, 5)
     of = lambda sigma: (
@@ -100,6 +100,7 @@ def test_tangents(adjoint):
     close(along(sigma), on_one_device(along, sigma))
 
 
+@slow
 def test_vmap():
     scene, camera = plain(), perspective(plain().volume, 9, 5)
     of = lambda rgb: jvr.render(eqx.tree_at(lambda s: s.transfer.rgb, scene, rgb), camera).rgb
@@ -123,6 +124,7 @@ def test_fits(keep):
     assert found[2] > 60
 
 
+@slow
 def test_somebody_else_spreads():
     """Inside of a `shard_map` of the user's, over their own mesh, each picture stays on its device."""
     mesh, here = jax.sharding.Mesh(np.array(jax.devices()), ("pictures",)), jax.sharding.PartitionSpec("pictures")
@@ -153,6 +155,7 @@ def test_a_volume_keeps_its_voxels_when_their_array_changes():
     np.testing.assert_array_equal(volume.values, 0.5)
 
 
+@slow
 def test_a_fit_goes_on_with_another_number_of_devices(tmp_path):
     scene, camera = plain(), perspective(plain().volume, 12, 9)
     images = [np.asarray(jvr.render(scene, camera).rgb)]
