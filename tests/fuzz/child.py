@@ -4,7 +4,7 @@
 with what came out.
 
 The memory that a file may take is four times what it announces and `REST`. It announces what its reader hands to `check_size` or
-`check_pixels` and these let pass: nothing, where a reader allocates without having asked. The highest use counts from what the process has
+`check_pixels` and these let pass, and at least what it takes on disk: no more, where a reader allocates without having asked. The highest use counts from what the process has
 before the file, with all libraries and behind a whole file of the format. A process that a reader starts is not measured: it has limits of
 its own (`jvr/io/volumes/decode.py`).
 
@@ -68,7 +68,9 @@ def _read(seed: Seed, path: Path, announced: Announced) -> dict[str, Any]:
     """Whether a file was accepted, and what is wrong with how it was read or refused."""
     # The highest use of memory starts anew at what is used here (Linux).
     Path("/proc/self/clear_refs").write_text("5")
-    announced.bytes, before, start = 0, _most_memory(), time.process_time()
+    files = path.rglob("*") if path.is_dir() else [path]
+    announced.bytes = sum(file.stat().st_size for file in files if file.is_file())
+    before, start = _most_memory(), time.process_time()
     problem, accepted = "", False
     try:
         with _terminal():
