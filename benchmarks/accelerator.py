@@ -33,7 +33,7 @@ class _March(ctypes.Structure):
     """`March` of the source."""
 
     _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("voxels", "table", "reach", "rays")),
+        *((name, ctypes.c_void_p) for name in ("voxels", "table", "radius", "rays")),
         *((name, ctypes.c_int * 3) for name in ("n", "bricks")),
         *((name, ctypes.c_int) for name in ("brick", "entries", "count")),
         *((name, ctypes.c_float) for name in ("low", "high", "dt", "termination")),
@@ -55,10 +55,10 @@ class HandWritten:
         table = jnp.concatenate([scene.transfer.rgb, scene.transfer.sigma_t[:, None]], axis=1)
         rays = jnp.stack([*aimed.rays.entry, *aimed.rays.direction, aimed.rays.length])
         low, high = np.asarray(scene.transfer.domain)
-        kinds = {"voxels": np.float32, "table": np.float32, "reach": np.uint8, "rays": np.float32}
-        found = (scene.volume.values, table, where.occupancy.reach, rays)
+        kinds = {"voxels": np.float32, "table": np.float32, "radius": np.uint8, "rays": np.float32}
+        found = (scene.volume.values, table, where.occupancy.empty_radius, rays)
         self.arrays = {name: np.ascontiguousarray(x, kind) for (name, kind), x in zip(kinds.items(), found, strict=True)}
-        shapes = {"n": scene.volume.shape, "bricks": where.occupancy.reach.shape}
+        shapes = {"n": scene.volume.shape, "bricks": where.occupancy.empty_radius.shape}
         self.march = _March(
             **{name: x.ctypes.data for name, x in self.arrays.items()},
             **{name: (ctypes.c_int * 3)(*shape) for name, shape in shapes.items()},

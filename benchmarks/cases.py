@@ -76,7 +76,7 @@ def gradient() -> dict[str, Any]:
 
 
 def skipping() -> dict[str, Any]:
-    """The CT of a torso through presets whose first position lies above air, at 192^2: everything over what leaps over empty bricks, for
+    """The CT of a torso through presets whose first position lies above air, at 192^2: everything over what skips empty bricks, for
     pictures and for gradients in voxels, colours and extinctions."""
     path = Path(os.environ.get("JVR_DATA", "data")) / "ct_torso" / "example_ct.nii.gz"
     if not path.exists():

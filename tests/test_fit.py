@@ -434,8 +434,8 @@ def test_residuals_are_rendered_minus_target():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("of", ["colours", pytest.param("voxels", marks=pytest.mark.slow)])
-def test_a_fit_leaps_over_what_has_no_derivative(of):
-    """Mostly empty at the start: the same iterations with leaps and without."""
+def test_a_fit_skips_what_has_no_derivative(of):
+    """Mostly empty at the start: the same iterations with skips and without."""
     values = np.zeros((17, 17, 17), np.float32)
     values[6:10, 6:10, 6:10] = np.random.default_rng(0).uniform(0.3, 1.0, (4, 4, 4))
     transfer = jvr.LinearTransfer([0.1, 0.5, 1.0], np.random.default_rng(1).random((3, 3)), [0.0, 0.2, 0.6])

@@ -1,4 +1,4 @@
-"""Empty-space skipping: bricks, leaps, and that a picture and its gradients are the same with and without."""
+"""Empty-space skipping: bricks, skips, and that a picture and its gradients are the same with and without."""
 
 import equinox as eqx
 import jax
@@ -32,19 +32,19 @@ def test_bricks_bound_the_voxels_around_each_of_their_points(shape, size):
 
 
 @pytest.mark.slow
-def test_reach_is_the_largest_known_empty_cube():
+def test_the_empty_radius_is_the_largest_known_empty_cube():
     """Against the definition, by brute force."""
     rng = np.random.default_rng(1)
     values = np.where(rng.random((31, 26, 29)) < 2e-3, 1.0, 0.0)
     table = jvr.LinearTransfer([0.0, 0.5, 1.0], np.ones((3, 3)), [0.0, 0.0, 1.0])
     bricks = bricks_of(jnp.asarray(values), 1)
-    reach = np.asarray(occupancy_of(bricks, jnp.asarray(1.0), jnp.asarray(0.0), table).reach)
+    empty_radius = np.asarray(occupancy_of(bricks, jnp.asarray(1.0), jnp.asarray(0.0), table).empty_radius)
     visible = np.argwhere(np.asarray(bricks.upper) > 0.5)
-    cells = np.stack(np.meshgrid(*map(np.arange, reach.shape), indexing="ij"), -1)
+    cells = np.stack(np.meshgrid(*map(np.arange, empty_radius.shape), indexing="ij"), -1)
     nearest = np.abs(cells[..., None, :] - visible).max(-1).min(-1)
     radii = np.asarray(RADII)
     largest = radii[np.searchsorted(radii, nearest - 1, side="right") - 1] + 1
-    np.testing.assert_array_equal(reach, np.where(nearest == 0, 0, largest))
+    np.testing.assert_array_equal(empty_radius, np.where(nearest == 0, 0, largest))
 
 
 TABLES = st.integers(2, 9).flatmap(lambda n: st.lists(st.sampled_from([0.0, 0.0, 1e-30, 0.05, 3.0]), min_size=n, max_size=n))
@@ -208,7 +208,7 @@ def test_gradient_where_matter_begins_is_the_same(x64):
 
 
 def test_rows_are_the_same(x64):
-    """Those of extinctions leap over nothing; those of colours, alone, over what is empty."""
+    """Those of extinctions skip nothing; those of colours, alone, over what is empty."""
     volume, transfer = scene_of(np.random.default_rng(2), (9, 8, 11), float, 1.0)
     scene, camera = jvr.Scene(volume.bricked(2), transfer), perspective(volume, 6, 5)
 
@@ -286,7 +286,7 @@ def test_what_is_negligible_stays_below_its_bound(negligible, x64):
 
 @pytest.mark.slow
 def test_fit_leaves_out_what_is_negligible(x64):
-    """Rows of the table leap as gradients do: both give the same normal equations, and the fit still finds its target."""
+    """Rows of the table skip as gradients do: both give the same normal equations, and the fit still finds its target."""
     scene, camera = faint_scene(np.random.default_rng(0))
     target = jvr.render(scene, camera).rgb
     start = eqx.tree_at(lambda s: s.transfer.rgb, scene, jnp.full_like(scene.transfer.rgb, 0.5))

@@ -122,7 +122,7 @@ def test_rays_of_a_fit_keep_their_digits():
         scene, camera = build(origin, 1e4, "perspective")
         images = [np.zeros((camera.height, camera.width, 3), np.float32)]
         observations = observe(scene, [camera], images, None, SETTINGS)
-        seen = seen_in_fit(scene, SETTINGS, leaps=False)
+        seen = seen_in_fit(scene, SETTINGS, skips=False)
         return observed_medium(scene, observations, None, SETTINGS, seen)[1]
 
     there, here = inside(UTM), inside((0.0, 0, 0))

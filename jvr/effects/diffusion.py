@@ -54,8 +54,8 @@ def kernel_of(dipole: Dipole, radius: float, volume: Volume, shape: tuple[int, .
     """`R_d` averaged over the cells of the nodes around a node, in each colour; zero beyond the radius."""
     steps = [(n - 1) / (m - 1) if m > 1 else 1.0 for n, m in zip(volume.shape, shape, strict=True)]
     longest = max(n - 1 for n in volume.shape)
-    reach = [min(math.ceil(radius * longest / step), m - 1) if m > 1 else 0 for step, m in zip(steps, shape, strict=True)]
-    offsets = np.stack(np.meshgrid(*[np.arange(-r, r + 1) for r in reach], indexing="ij"), axis=-1)
+    half_widths = [min(math.ceil(radius * longest / step), m - 1) if m > 1 else 0 for step, m in zip(steps, shape, strict=True)]
+    offsets = np.stack(np.meshgrid(*[np.arange(-r, r + 1) for r in half_widths], indexing="ij"), axis=-1)
     axes = volume.world_from_grid[:3, :3] * jnp.asarray(steps)
     length = lambda offset: jnp.linalg.norm(offset @ axes.T, axis=-1)
     side = jnp.max(volume.spacing * (np.asarray(volume.shape) - 1))

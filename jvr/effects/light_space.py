@@ -62,11 +62,12 @@ class ParallelSpace(AbstractLightSpace):
 
 
 class FanSpace(AbstractLightSpace):
-    """A point: unit directions are placed at `rho = sin(theta / 2) / reach` about the axis, and rays go from `near` to `far`."""
+    """A point: unit directions are placed at `rho = sin(theta / 2) / rim` about the axis, 1 at the edge of the cone of its rays,
+    which go from `near` to `far`."""
 
     position: Vector
     axes: Float[Array, "3 3"]
-    reach: Scalar
+    rim: Scalar
     near: Scalar
     far: Scalar
 
@@ -80,14 +81,14 @@ class FanSpace(AbstractLightSpace):
         (a, b, _), sideways = direction_and_length((across, up, jnp.zeros_like(along)))
         a = jnp.where(sideways > 0, a, 1.0)
         rho = jnp.sqrt(0.5 * (1 - jnp.where(ahead, 0.0, along)))
-        u, v = (jnp.where(ahead, c * scale, rho * d) / self.reach for c, d in ((across, a), (up, b)))
+        u, v = (jnp.where(ahead, c * scale, rho * d) / self.rim for c, d in ((across, a), (up, b)))
         return u, v, (distance - self.near) / (self.far - self.near)
 
     def ray(self, u: Scalar, v: Scalar) -> tuple[Triple, Triple, Scalar]:
         across, up, along = self.axes
-        square = jnp.minimum((u * u + v * v) * self.reach**2, 1.0)
+        square = jnp.minimum((u * u + v * v) * self.rim**2, 1.0)
         # The clamp keeps the root's derivative finite in the corners of the square, which stand for no direction.
-        sideways = 2 * self.reach * jnp.sqrt(jnp.maximum(1 - square, 1e-6))
+        sideways = 2 * self.rim * jnp.sqrt(jnp.maximum(1 - square, 1e-6))
         d = tuple((1 - 2 * square) * along[i] + sideways * (u * across[i] + v * up[i]) for i in range(3))
         d, _ = direction_and_length(d)
         return tuple(self.position[i] + self.near * d[i] for i in range(3)), d, self.far - self.near

@@ -26,7 +26,7 @@ class ShadowRays(AbstractShadows):
     rule from the sample to the light or to where the volume (or its clipping box) ends.
 
     **Arguments:** `step`: length of a segment in voxels of the smallest spacing; `termination`: a shadow ray ends once its transmittance is
-    at most this, which bounds the error. Empty bricks are leapt over, and points without extinction get no ray in pictures.
+    at most this, which bounds the error. Empty bricks are skipped, and points without extinction get no ray in pictures.
 
     Differentiable in transfer function, voxels, lights and pose. Detached: number of segments and termination. Costs about as many samples
     for each sample of the picture as the light's way through the volume has steps.

@@ -127,10 +127,10 @@ class TransferProjection(eqx.Module):
         p, occupancy = jnp.asarray(self.positions()), self.medium.occupancy
         if occupancy is None:
             return jnp.ones(p.shape[0], bool)
-        bricks, shape = occupancy.reach.shape, self.transfer.shape(self.volume)
+        bricks, shape = occupancy.empty_radius.shape, self.transfer.shape(self.volume)
         b = [jnp.clip((p[:, i] / occupancy.size).astype(jnp.int32), 0, n - 1) for i, n in enumerate(bricks)]
         near = max((n - 1) / max(m - 1, 1) for n, m in zip(self.volume.shape, shape, strict=True))
-        return occupancy.reach[b[0], b[1], b[2]] <= math.ceil(near / occupancy.size)
+        return occupancy.empty_radius[b[0], b[1], b[2]] <= math.ceil(near / occupancy.size)
 
 
 def project_all(projection: TransferProjection) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:

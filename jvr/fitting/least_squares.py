@@ -1,7 +1,7 @@
 """Least squares within bounds, over normal equations that were summed in chunks: a matrix of all rays is never held.
 
 With the gradient `g` and the Gauss-Newton matrix `H` of the objective `F`, a step `d` minimises the model `g.d + d.H d / 2` among the
-steps that stay within the bounds of the unknowns and within the reach of each: damped (Levenberg 1944, Marquardt 1963), as it is, or
+steps that stay within the bounds of the unknowns and within the trust region of each: damped (Levenberg 1944, Marquardt 1963), as it is, or
 along Powell's dogleg. Because the step is found there and not cut afterwards, the model never promises more than the step can hold, and an
 unknown at its bound leaves it as soon as the gradient points inwards.
 """
@@ -210,8 +210,8 @@ def _model(functions: Functions, state: ChunkedState) -> tuple[Model, Float[np.n
     diagonal = np.diag(matrix)
     scale = 1 / np.sqrt(np.maximum(diagonal, FLOOR * diagonal.max(initial=TINY)))
     limits = functions.limits(state.real)
-    lower = np.maximum(limits.lower - state.real, -limits.reach) / scale
-    upper = np.minimum(limits.upper - state.real, limits.reach) / scale
+    lower = np.maximum(limits.lower - state.real, -limits.trust_radius) / scale
+    upper = np.minimum(limits.upper - state.real, limits.trust_radius) / scale
     scaled = scale[:, None] * matrix * scale + RIDGE * np.eye(len(scale))
     # A start at its bound may be rounded to the other side of it.
     return Model(float(state.loss), scale * gradient, scaled, np.minimum(lower, 0.0), np.maximum(upper, 0.0)), scale
@@ -252,7 +252,7 @@ def LevenbergMarquardt(rtol: float = 1e-3) -> ChunkedLeastSquares:
 
 
 def GaussNewton(rtol: float = 1e-3) -> ChunkedLeastSquares:
-    """Undamped Gauss-Newton: fastest near the solution, no guard far from it but the reach of each unknown."""
+    """Undamped Gauss-Newton: fastest near the solution, no guard far from it but the trust region of each unknown."""
     return ChunkedLeastSquares(Undamped(), optx.LearningRate(1.0), rtol)
 
 

@@ -40,10 +40,10 @@ class Problem(eqx.Module):
     loss: Any  # AbstractLoss, or DSSIM for solvers that use gradients alone
     priors: tuple[AbstractPrior, ...]
     samples: Samples | None
-    leaps: bool = eqx.field(static=True, default=False)  # over empty bricks, in what has no derivative there
+    skips: bool = eqx.field(static=True, default=False)  # empty bricks, in what has no derivative there
 
     def with_samples(self, samples: Samples) -> "Problem":
-        return Problem(self.model, self.unknowns, self.settings, self.loss, self.priors, samples, self.leaps)
+        return Problem(self.model, self.unknowns, self.settings, self.loss, self.priors, samples, self.skips)
 
     def apart(self) -> "tuple[Problem, Array | None]":
         """What all devices share of it, and the kept samples, of which each has those of its own rays."""
@@ -60,7 +60,7 @@ class Problem(eqx.Module):
 
     def least_squares(self) -> "Problem":
         """The same unknowns and data, the squared error alone."""
-        return Problem(self.model, self.unknowns, self.settings, SquaredError(), (), self.samples, self.leaps)
+        return Problem(self.model, self.unknowns, self.settings, SquaredError(), (), self.samples, self.skips)
 
 
 class _Channel(eqx.Module):
@@ -98,7 +98,7 @@ def predict(problem: Problem, model: Exposed, gathered: Marched, length: Float[A
 def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Scalar:
     """Mean loss over all pixels plus priors, as a function of the unknowns on the real line. `pieces` has a leading axis of chunks."""
     model = problem.unknowns.model_from_real(problem.model, real)
-    seen = seen_in_fit(model.scene, problem.settings, problem.leaps)
+    seen = seen_in_fit(model.scene, problem.settings, problem.skips)
     shared, stored = problem.apart()
 
     def share(shared: tuple[Problem, Exposed, Seen], rays: tuple[Array | None, Observations]) -> Array:
@@ -119,7 +119,7 @@ def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations
 def residuals(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Array:
     """The whole residual vector, scaled to a squared length of the mean squared error; priors have no residuals."""
     model = problem.unknowns.model_from_real(problem.model, real)
-    adjoint, seen = adjoint_of(problem), seen_in_fit(model.scene, problem.settings, problem.leaps)
+    adjoint, seen = adjoint_of(problem), seen_in_fit(model.scene, problem.settings, problem.skips)
     shared, stored = problem.apart()
 
     def share(shared: tuple[Problem, Exposed, Seen, Scalar], rays: tuple[Array | None, Observations]) -> Array:
@@ -151,7 +151,7 @@ def image_value(
     """`value` for a loss over whole images: the mean over images plus priors."""
     model = problem.unknowns.model_from_real(problem.model, real)
     settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
-    losses, where = [], seen_in_fit(model.scene, settings, problem.leaps)
+    losses, where = [], seen_in_fit(model.scene, settings, problem.skips)
     for camera, target in zip(cameras, images, strict=True):
         rendered = _rendered(problem, model, camera, settings, where)
         losses.append(problem.loss.image(rendered, target))
@@ -208,7 +208,7 @@ def _prepared(problem: Problem, values: Float[Array, "unknowns"]) -> Prepared:
     kinds = _Kinds.of(problem)
 
     def around(part: Array) -> tuple[Any, Any]:
-        seen = seen_in_fit(kinds.changed(part, values).scene, problem.settings, problem.leaps)
+        seen = seen_in_fit(kinds.changed(part, values).scene, problem.settings, problem.skips)
         return eqx.partition(seen.shadows, eqx.is_inexact_array)
 
     part = values[kinds.inner]
@@ -283,7 +283,7 @@ def _jacobian(
 
     def observed(scene: Scene, arrays: Any) -> tuple[Medium, Rays]:
         visible = None if around is None else eqx.combine(arrays, rest)
-        seen = seen_in_fit(scene, problem.settings, problem.leaps, visible)
+        seen = seen_in_fit(scene, problem.settings, problem.skips, visible)
         return observed_medium(scene, piece, problem.samples, problem.settings, seen)
 
     def of_inner(part: Array, arrays: Any) -> tuple[Triple, Marched]:

@@ -222,18 +222,18 @@ def _kept_range(scene: Scene, clamped: bool) -> tuple[Float[Array, ""], Float[Ar
     return low, high
 
 
-def seen_in_fit(scene: Scene, settings: Settings, leaps: bool, visible: AbstractVisibility | None = None) -> Seen:
-    """What is computed once for all rays; `leaps`: whether rays leap over empty bricks although nothing else is negligible; `visible`: how
+def seen_in_fit(scene: Scene, settings: Settings, skips: bool, visible: AbstractVisibility | None = None) -> Seen:
+    """What is computed once for all rays; `skips`: whether rays skip empty bricks although nothing else is negligible; `visible`: how
     much light reaches a point, where that is known."""
     (scene,) = near_volume(scene)
-    where = occupancy(scene, settings) if settings.negligible or leaps else None
+    where = occupancy(scene, settings) if settings.negligible or skips else None
     return Seen(where, visibility(scene, where) if visible is None else visible, natural(scene))
 
 
 def is_mostly_empty(scene: Scene, settings: Settings) -> bool:
     """Whether rays through a scene are better off with a look at its bricks before each sample: half of them are empty."""
     where = jax.jit(occupancy, static_argnums=1)(scene, settings)
-    return where is not None and float(jnp.mean(where.reach > 0)) >= 0.5
+    return where is not None and float(jnp.mean(where.empty_radius > 0)) >= 0.5
 
 
 def observed_medium(

@@ -18,7 +18,7 @@ class Limits(NamedTuple):
 
     lower: Float[np.ndarray, "n"]
     upper: Float[np.ndarray, "n"]
-    reach: Float[np.ndarray, "n"]
+    trust_radius: Float[np.ndarray, "n"]
 
 
 class Functions(NamedTuple):

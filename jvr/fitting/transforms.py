@@ -40,7 +40,7 @@ class AbstractTransform(eqx.Module):
         """The least and the largest real number for each of `real`."""
 
     @abc.abstractmethod
-    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def trust_radius(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """How far from each of `real` a linearisation of the pictures may be good for."""
 
 
@@ -60,7 +60,7 @@ class Identity(AbstractTransform):
     def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
         return _unbounded(real)
 
-    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def trust_radius(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         return np.full(real.shape, np.inf)
 
 
@@ -83,14 +83,14 @@ class Bounded(AbstractTransform):
         ends = (np.full(real.shape, end / float(self.scale)) for end in (self.low, self.high))
         return next(ends), next(ends)
 
-    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def trust_radius(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         # What is bounded on one side acts by its logarithm, as extinctions do: a linearisation is good for a few times the value.
         one_sided = np.isfinite(self.low) and not np.isfinite(self.high)
         return 0.1 + 2 * np.abs(real) if one_sided else np.full(real.shape, np.inf)
 
 
 # Within this distance the curved transforms change their slope by less than an order of magnitude.
-REACH = 2.0
+TRUST_RADIUS = 2.0
 
 
 class Softplus(AbstractTransform):
@@ -109,8 +109,8 @@ class Softplus(AbstractTransform):
     def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
         return _unbounded(real)
 
-    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        return np.full(real.shape, REACH)
+    def trust_radius(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        return np.full(real.shape, TRUST_RADIUS)
 
 
 class Sigmoid(AbstractTransform):
@@ -129,8 +129,8 @@ class Sigmoid(AbstractTransform):
     def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
         return _unbounded(real)
 
-    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        return np.full(real.shape, REACH)
+    def trust_radius(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        return np.full(real.shape, TRUST_RADIUS)
 
 
 class Direction(AbstractTransform):
@@ -145,7 +145,7 @@ class Direction(AbstractTransform):
     def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
         return _unbounded(real)
 
-    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def trust_radius(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         # About 30 degrees.
         return np.full(real.shape, 0.5)
 
@@ -166,8 +166,8 @@ class Ordered(AbstractTransform):
     def bounds(self, real: Float[np.ndarray, "..."]) -> Bounds:
         return _unbounded(real)
 
-    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        return np.full(real.shape, REACH)
+    def trust_radius(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        return np.full(real.shape, TRUST_RADIUS)
 
 
 class Gaps(AbstractTransform):
@@ -186,7 +186,7 @@ class Gaps(AbstractTransform):
         low[1:] = MARGIN
         return low, high
 
-    def reach(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def trust_radius(self, real: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         return np.full(real.shape, 0.5)
 
 
@@ -205,8 +205,8 @@ class Entrywise(AbstractTransform):
         low, high = zip(*(part.bounds(x) for part, x in self._apart(real)), strict=True)
         return np.concatenate(low), np.concatenate(high)
 
-    def reach(self, real: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        return np.concatenate([part.reach(x) for part, x in self._apart(real)])
+    def trust_radius(self, real: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        return np.concatenate([part.trust_radius(x) for part, x in self._apart(real)])
 
     def _apart(self, values: Any) -> Any:
         """Each map with its entry, `(1,)`."""

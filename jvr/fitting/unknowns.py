@@ -60,9 +60,9 @@ class Unknowns(eqx.Module):
     def limits(self, model: Exposed, real: Float[np.ndarray, "unknowns"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The least and the largest real number of each unknown, and how far it may move from `real` in one step."""
         parts = [np.atleast_1d(np.asarray(part, np.float64)) for part in self.split(jnp.asarray(real), model)]
-        limits = [(*t.bounds(part), t.reach(part)) for t, part in zip(self.transforms, parts, strict=True)]
-        lower, upper, reach = (np.concatenate([np.ravel(a) for a in arrays]) for arrays in zip(*limits, strict=True))
-        return lower, upper, reach
+        limits = [(*t.bounds(part), t.trust_radius(part)) for t, part in zip(self.transforms, parts, strict=True)]
+        lower, upper, trust_radius = (np.concatenate([np.ravel(a) for a in arrays]) for arrays in zip(*limits, strict=True))
+        return lower, upper, trust_radius
 
     def model_from_real(self, model: Exposed, real: Float[Array, "unknowns"]) -> Exposed:
         """The model whose unknowns are those of `real`."""

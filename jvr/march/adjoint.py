@@ -26,7 +26,7 @@ from jvr.march.batch import pooled_while
 from jvr.march.march import Marched, MarchOptions, Noted, integrate, march
 from jvr.march.medium import Medium, for_derivatives
 from jvr.march.rules import is_zero, wanted_and_fixed, with_zeros
-from jvr.march.segments import Lanes, Stretch, lanes_of, lit, places, resample, shown
+from jvr.march.segments import Lanes, Stretch, lanes_of, lit, occupied_count, places, resample
 from jvr.march.steps import Rays, Sample, points_at, segment
 from jvr.march.sums import opacity, through, transmittance
 from jvr.numerics import computed_once, one_minus_exp, two_sum
@@ -81,7 +81,7 @@ class BackLanes(NamedTuple):
         """The index of the `j`-th segment from the back, and the number of segments, 0 for rays that are done."""
         return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.lanes.segments, 0)
 
-    def leap(self, medium: Medium, dt: Scalar, j: Int[Array, "rays"]) -> Int[Array, "rays"]:
+    def skip(self, medium: Medium, dt: Scalar, j: Int[Array, "rays"]) -> Int[Array, "rays"]:
         """The next segment from the back, from the `j`-th on, whose midpoint may lie in a visible brick, or the number of them."""
         if medium.occupancy is None:
             return j
@@ -89,7 +89,7 @@ class BackLanes(NamedTuple):
         extent, u = segment(jnp.maximum(self.steps - 1 - j, 0), self.lanes.segments, rays.length, dt)
         within = len(medium.shader.places) > 1
         first = u + extent / 2 if within else u
-        return jnp.minimum(j + medium.occupancy.leap(rays, first, dt, backwards=True, within=within), self.steps)
+        return jnp.minimum(j + medium.occupancy.skip(rays, first, dt, backwards=True, within=within), self.steps)
 
     def nothing_behind(self, emits: int, *, distance: bool) -> Behind:
         """What the last segment has behind it."""
@@ -102,7 +102,7 @@ class BackLanes(NamedTuple):
         given where the forward march has noted it, else that in front of the next segment less its own."""
         k, channels = self.steps - 1 - j, []
         for front, last, high, low, d in zip(self.front, self.last, behind.tau, behind.tau_low, dtau, strict=True):
-            # What was noted holds in front of segment `last` and, where that was leapt over, behind the first one that is reached.
+            # What was noted holds in front of segment `last` and, where that was skipped, behind the first one that is reached.
             first = jnp.isinf(high)
             high, low = jnp.where(first, front, high), jnp.where(first, 0.0, low)
             high, low = two_sum(high, low, jnp.where(k < last, -d, 0.0))
@@ -176,9 +176,9 @@ def replay(wanted: Any, fixed: Any, noted: Noted, cotangent: Marched) -> Any:
 
 
 def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marched, state: _ReplayState, total: _Gradients):
-    state = state._replace(j=back.leap(medium, dt, state.j))
+    state = state._replace(j=back.skip(medium, dt, state.j))
     lanes, (k, count) = back.lanes, back.at(state.j)
-    count = shown(medium, lanes, dt, k, count)
+    count = occupied_count(medium, lanes, dt, k, count)
     # The field is not among `small`: it deposits its derivative itself, in place, through the tap.
     small_mask = is_there((total.medium.transfer, total.medium.shader, total.medium.shadows, state.gradient, total.dt))
     small, rest = eqx.partition((medium.transfer, medium.shader, medium.shadows, lanes.rays, dt), small_mask)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Int
 
 from jvr.march.batch import pooled_while
 from jvr.march.medium import Medium
-from jvr.march.segments import Lanes, channel_counts, first_visible, lanes_of, leap, shown, take_segment
+from jvr.march.segments import Lanes, channel_counts, first_visible, lanes_of, occupied_count, skip, take_segment
 from jvr.march.steps import Rays
 from jvr.march.sums import Sums, add_segment, join, opaque_depth
 from jvr.types import Channels, Scalar
@@ -85,12 +85,14 @@ def integrate(
 
     def advance(inputs: tuple[Lanes, Int[Array, "rays"]], progress: Progress, _: None) -> tuple[Progress, None]:
         lanes = inputs[0]
-        k = jnp.where(is_alive(options, lanes, progress), leap(medium, lanes, dt, progress.following), progress.following)
-        leapt, progress = k > progress.following, progress._replace(following=k)
+        k = jnp.where(is_alive(options, lanes, progress), skip(medium, lanes, dt, progress.following), progress.following)
+        skipped, progress = k > progress.following, progress._replace(following=k)
         alive = is_alive(options, lanes, progress)
-        emitted, dtau, u = take_segment(medium, lanes, dt, k, shown(medium, lanes, dt, k, jnp.where(alive, lanes.segments, 0)))
-        # Where a ray ends with a leap, the last segment that it leapt over is the one to be noted.
-        front, last = note_front(progress, alive | leapt, k - ~alive) if for_replay else ((), ())
+        emitted, dtau, u = take_segment(
+            medium, lanes, dt, k, occupied_count(medium, lanes, dt, k, jnp.where(alive, lanes.segments, 0))
+        )
+        # Where a ray ends with a skip, the last segment that it skipped is the one to be noted.
+        front, last = note_front(progress, alive | skipped, k - ~alive) if for_replay else ((), ())
         sums = add_segment(progress.sums, emitted, dtau, u)
         return Progress(sums, k + alive, progress.steps + alive, front, last), None
 

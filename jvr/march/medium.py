@@ -106,7 +106,7 @@ def for_derivatives(medium: Medium, wanted: Medium, moved: Any = None) -> Medium
 
 
 def taking_all(medium: Medium) -> Medium:
-    """A medium in which nothing that may have a derivative is leapt over, on the way of light neither."""
+    """A medium in which nothing that may have a derivative is skipped, on the way of light neither."""
     is_occupancy = lambda x: isinstance(x, Occupancy)
     dropped = lambda x: None if is_occupancy(x) and not x.is_bounded else x
     return jax.tree.map(dropped, medium, is_leaf=is_occupancy)

@@ -119,12 +119,12 @@ class LocalError(_Tolerant):
 
 
 def distance_field(
-    oracle: AbstractOracle, volume: Volume, table: LinearTransfer | LutTransfer, optical: AbstractOpticalModel, reach: Scalar
+    oracle: AbstractOracle, volume: Volume, table: LinearTransfer | LutTransfer, optical: AbstractOpticalModel, farthest: Scalar
 ) -> DistanceField:
-    """What `oracle` says, up to the world length `reach`; traceable, not differentiable."""
-    volume, table, optical, reach = jax.lax.stop_gradient((volume, table, optical, reach))
+    """What `oracle` says, up to the world length `farthest`; traceable, not differentiable."""
+    volume, table, optical, farthest = jax.lax.stop_gradient((volume, table, optical, farthest))
     wanted = oracle.wanted(volume, look_at(volume, table, optical))
-    return DistanceField(envelope(wanted, thickness(volume, oracle.brick), reach), oracle.brick)
+    return DistanceField(envelope(wanted, thickness(volume, oracle.brick), farthest), oracle.brick)
 
 
 def thickness(volume: Volume, brick: int) -> Triple:
@@ -134,8 +134,8 @@ def thickness(volume: Volume, brick: int) -> Triple:
     return tuple(brick / jnp.linalg.norm(row) for row in rows)
 
 
-def envelope(wanted: Float[Array, "bx by bz"], thickness: Triple, reach: Scalar) -> Float[Array, "bx by bz"]:
-    """`min over bricks b of wanted[b] + (distance to b)`, for every brick; at most `reach` and what is wanted there.
+def envelope(wanted: Float[Array, "bx by bz"], thickness: Triple, farthest: Scalar) -> Float[Array, "bx by bz"]:
+    """`min over bricks b of wanted[b] + (distance to b)`, for every brick; at most `farthest` and what is wanted there.
 
     Distances are between slabs, `max over axes of (|difference of indices| - 1) * thickness`: never more than the Euclidean distance
     between any two points of the bricks. With 0 and infinity in `wanted` this is a distance transform (chessboard metric).
@@ -150,8 +150,8 @@ def envelope(wanted: Float[Array, "bx by bz"], thickness: Triple, reach: Scalar)
             smallest = jnp.where(now > before, _smallest_of_three(smallest, axis), smallest)
         return k + 1, smallest, jnp.minimum(distance, smallest + k * finest)
 
-    start = (jnp.int32(0), wanted, jnp.minimum(wanted, reach))
-    return jax.lax.while_loop(lambda state: state[0] * finest < reach, grow, start)[2]
+    start = (jnp.int32(0), wanted, jnp.minimum(wanted, farthest))
+    return jax.lax.while_loop(lambda state: state[0] * finest < farthest, grow, start)[2]
 
 
 def _smallest_of_three(values: Float[Array, "x y z"], axis: int) -> Float[Array, "x y z"]:

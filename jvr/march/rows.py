@@ -21,7 +21,7 @@ from jvr.march.adjoint import BackLanes, Behind, segment_cotangents, step_back
 from jvr.march.batch import pooled_while
 from jvr.march.march import Marched, MarchOptions, integrate
 from jvr.march.medium import Medium, for_derivatives
-from jvr.march.segments import Stretch, lanes_of, light_at, shown
+from jvr.march.segments import Stretch, lanes_of, light_at, occupied_count
 from jvr.march.shaders import where_known
 from jvr.march.steps import Rays, points_at, segment
 from jvr.march.sums import transmittance
@@ -91,9 +91,9 @@ def table_rows(
 
 def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, of_extinctions: bool, behind: Behind, j: Int[Array, "rays"]):
     """One segment of every ray: the state before it, where its samples fall in the table, and the weights of their hats."""
-    j = back.leap(medium, dt, j)
+    j = back.skip(medium, dt, j)
     lanes, (k, count) = back.lanes, back.at(j)
-    count = shown(medium, lanes, dt, k, count)
+    count = occupied_count(medium, lanes, dt, k, count)
     extent, distance = segment(k, count, lanes.rays.length, dt)
     points = points_at(lanes.rays, lanes.ray, k, distance)
     samples = jax.vmap(medium.field.resample)(points)

@@ -14,8 +14,8 @@ from jvr.model.transfer import Classified
 from jvr.numerics import computed_once, mean_depth
 from jvr.types import Channels, Scalar
 
-# Leaps before a ray is started.
-FIRST_LEAPS = 8
+# Skips before a ray is started.
+FIRST_SKIPS = 8
 
 
 class Lanes(NamedTuple):
@@ -43,32 +43,34 @@ def lanes_of(rays: Rays, dt: Scalar) -> Lanes:
     return Lanes(rays, jnp.arange(count.size, dtype=jnp.int32), count)
 
 
-def leap(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"]) -> Int[Array, "rays"]:
+def skip(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"]) -> Int[Array, "rays"]:
     """The next segment, from `k` on, that may have a sample in a visible brick, or the number of segments."""
     if medium.occupancy is None:
         return k
     extent, u = segment(k, lanes.segments, lanes.rays.length, dt)
     within = len(medium.shader.places) > 1
     first = u - extent / 2 if within else u
-    return jnp.minimum(k + medium.occupancy.leap(lanes.rays, first, dt, within=within), lanes.segments)
+    return jnp.minimum(k + medium.occupancy.skip(lanes.rays, first, dt, within=within), lanes.segments)
 
 
 def first_visible(medium: Medium, lanes: Lanes, dt: Scalar) -> Int[Array, "rays"]:
-    """The segment that each ray starts with: a few leaps on from its entry. Most of the rays that see nothing end here, and what is
+    """The segment that each ray starts with: a few skips on from its entry. Most of the rays that see nothing end here, and what is
     left of the others says better how long they will take."""
     first = jnp.zeros_like(lanes.segments)
     if medium.occupancy is None:
         return first
-    return jax.lax.fori_loop(0, FIRST_LEAPS, lambda _, k: leap(medium, lanes, dt, k), first)
+    return jax.lax.fori_loop(0, FIRST_SKIPS, lambda _, k: skip(medium, lanes, dt, k), first)
 
 
-def shown(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]) -> Int[Array, "rays"]:
-    """`count`, the number of segments, and 0 for rays whose segment `k` is not to be seen. A leap may end in another empty brick; where
+def occupied_count(
+    medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]
+) -> Int[Array, "rays"]:
+    """`count`, the number of segments, and 0 for rays whose segment `k` is not to be seen. A skip may end in another empty brick; where
     empty means negligible, both directions have to take the same segments."""
     if medium.occupancy is None or not medium.occupancy.is_bounded:
         return count
     _, u = segment(k, count, lanes.rays.length, dt)
-    return jnp.where(medium.occupancy.shows(lanes.rays, u), count, 0)
+    return jnp.where(medium.occupancy.is_occupied(lanes.rays, u), count, 0)
 
 
 def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
@@ -144,8 +146,8 @@ def light_at(
     # Without extinction there is nothing to see; but where it begins, or nothing is left out, it has a derivative, and between the ends of
     # a segment there may be what is at neither.
     everywhere = medium.occupancy is None or len(medium.shader.places) > 1
-    shows = functools.reduce(jnp.logical_or, [x != 0 for x in (*sigma_t, *slopes)])
-    wanted = where.inside if everywhere else where.inside & shows
+    occupied = functools.reduce(jnp.logical_or, [x != 0 for x in (*sigma_t, *slopes)])
+    wanted = where.inside if everywhere else where.inside & occupied
     return computed_once(where.inside, medium.shadows.transmittances(points, wanted, reverse=reverse))
 
 

@@ -62,8 +62,8 @@ def render_slices(
     options = SliceOptions(sampling.levels, width, height, settings.termination, _segment)
     lattice, finest, t_in = _lattice(scene, camera, plane, options, dt)
     if distances is None:
-        reach = _reach(scene, sampling, options, lattice, dt)
-        distances = distance_field(sampling.oracle, scene.volume, table, scene.optical, reach)
+        farthest = _farthest(scene, sampling, options, lattice, dt)
+        distances = distance_field(sampling.oracle, scene.volume, table, scene.optical, farthest)
 
     parts = settings.quadrature.parts if isinstance(settings.quadrature, PreIntegrated) else 1
     shading = (PreIntegratedTable(table, parts), scene.optical)
@@ -104,10 +104,10 @@ def _segment(shading: Any, lanes: tuple[Array, Array, Array]) -> tuple[Channels,
     return jax.vmap(lambda front, back, length: table.segment(optical, front, back, length))(*lanes)
 
 
-def _reach(scene: Scene, sampling: Slices, options: SliceOptions, lattice: Lattice, dt: Scalar) -> Scalar:
+def _farthest(scene: Scene, sampling: Slices, options: SliceOptions, lattice: Lattice, dt: Scalar) -> Scalar:
     """How far the oracle has to look for a picture to make use of it."""
-    farthest = jnp.maximum(jnp.max(lattice.last), 0)
-    largest = jnp.maximum(dt, lattice.unit + farthest * lattice.unit_slope)
+    last = jnp.maximum(jnp.max(lattice.last), 0)
+    largest = jnp.maximum(dt, lattice.unit + last * lattice.unit_slope)
     across = thickness(scene.volume, sampling.oracle.brick)
     # A sample with twice the largest distance is the coarsest there is.
     return jnp.minimum(2 * options.period * largest, FARTHEST * jnp.minimum(jnp.minimum(across[0], across[1]), across[2]))

@@ -72,10 +72,10 @@ def _visible_corners(volume: Volume, transfer: AbstractTransfer) -> np.ndarray:
     """World positions of the corners of all visible bricks, `(n, 3)`."""
     bricks = volume.bricks if volume.bricks is not None else volume.bricked().bricks
     assert bricks is not None
-    reach = np.asarray(eqx.filter_jit(occupancy_of)(bricks, volume.slope, volume.intercept, transfer).reach)
+    empty_radius = np.asarray(eqx.filter_jit(occupancy_of)(bricks, volume.slope, volume.intercept, transfer).empty_radius)
     if volume.gaps is not None:
-        reach = np.where(_without_data(volume, bricks.size), 1, reach)
-    first = np.argwhere(_without_specks(reach == 0))[:, None] * bricks.size
+        empty_radius = np.where(_without_data(volume, bricks.size), 1, empty_radius)
+    first = np.argwhere(_without_specks(empty_radius == 0))[:, None] * bricks.size
     grid = first + np.array(list(itertools.product((0, bricks.size), repeat=3)))
     low, high = volume.domain
     grid = np.unique(np.clip(grid.reshape(-1, 3), low, high), axis=0)
@@ -119,14 +119,14 @@ def _pose(table: PerspectiveTable | OrthographicTable, center: np.ndarray) -> tu
     return right, np.cross(back, right), back
 
 
-def _rig(table: RigTable, center: np.ndarray, reach: float) -> tuple[PerspectiveCamera, ...]:
+def _rig(table: RigTable, center: np.ndarray, extent: float) -> tuple[PerspectiveCamera, ...]:
     if table.half_angle_tangent is not None:
         fov_y = 2 * np.degrees(np.arctan(table.half_angle_tangent))
     else:
         fov_y = 30.0 if table.fov_y is None else table.fov_y
     aspect = min(1.0, table.width / table.height)
     half = np.arctan(np.tan(np.radians(fov_y / 2)) * aspect)
-    radius = reach / np.sin(half) if table.radius is None else table.radius
+    radius = extent / np.sin(half) if table.radius is None else table.radius
     if table.kind == "fibonacci":
         return fibonacci_sphere(center, radius, table.count, fov_y, table.width, table.height)
     axis = (0.0, 0.0, 1.0) if table.axis is None else table.axis
