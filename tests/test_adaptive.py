@@ -161,7 +161,7 @@ def test_every_selected_element_is_worked_on_once(size, share):
 def test_a_selected_map_has_the_derivative_of_the_map(x64):
     rng = np.random.default_rng(0)
     mask, x, weights = rng.random(5000) < 0.6, rng.random(5000), rng.random(5000)
-    f = lambda shared, lanes: jnp.sin(shared * lanes[0]) * lanes[1]
+    f = lambda shared, block: jnp.sin(shared * block[0]) * block[1]
     some = lambda a, x, y: jnp.sum(weights * map_selected(f, mask, a, (x, y)))
     whole = lambda a, x, y: jnp.sum(weights * jnp.where(mask, f(a, (x, y)), 0.0))
     mask = jnp.asarray(mask)

@@ -22,13 +22,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.batch import pooled_while
 from jvr.march.march import Marched, MarchOptions, Noted, integrate, march
 from jvr.march.medium import Medium, for_derivatives
 from jvr.march.rules import is_zero, wanted_and_fixed, with_zeros
-from jvr.march.segments import Lanes, Stretch, lanes_of, lit, occupied_count, places, resample
+from jvr.march.segments import ActiveRays, Stretch, active_rays, lit, occupied_count, places, resample
 from jvr.march.steps import Rays, Sample, points_at, segment
 from jvr.march.sums import opacity, through, transmittance
+from jvr.march.wavefront import wavefront_while
 from jvr.numerics import computed_once, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
@@ -68,32 +68,32 @@ class Behind(NamedTuple):
     tau_low: Channels
 
 
-class BackLanes(NamedTuple):
+class BackwardRays(NamedTuple):
     """A batch of rays that are walked backwards, from segment `steps - 1` on; `front` and `last` are those of the forward march's
     `Noted`."""
 
-    lanes: Lanes
+    active: ActiveRays
     steps: Int[Array, "rays"]
     front: Channels
     last: tuple[Int[Array, "rays"], ...]
 
     def at(self, j: Int[Array, "rays"]) -> tuple[Int[Array, "rays"], Int[Array, "rays"]]:
         """The index of the `j`-th segment from the back, and the number of segments, 0 for rays that are done."""
-        return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.lanes.segments, 0)
+        return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.active.segments, 0)
 
     def skip(self, medium: Medium, dt: Scalar, j: Int[Array, "rays"]) -> Int[Array, "rays"]:
         """The next segment from the back, from the `j`-th on, whose midpoint may lie in a visible brick, or the number of them."""
         if medium.occupancy is None:
             return j
-        rays = self.lanes.rays
-        extent, u = segment(jnp.maximum(self.steps - 1 - j, 0), self.lanes.segments, rays.length, dt)
+        rays = self.active.rays
+        extent, u = segment(jnp.maximum(self.steps - 1 - j, 0), self.active.segments, rays.length, dt)
         within = len(medium.shader.places) > 1
         first = u + extent / 2 if within else u
         return jnp.minimum(j + medium.occupancy.skip(rays, first, dt, backwards=True, within=within), self.steps)
 
     def nothing_behind(self, emits: int, *, distance: bool) -> Behind:
         """What the last segment has behind it."""
-        zero = jnp.zeros_like(self.lanes.rays.length)
+        zero = jnp.zeros_like(self.active.rays.length)
         blank = (zero,) * len(self.front)
         return Behind((zero,) * emits, blank * distance, self.front, blank)
 
@@ -158,46 +158,46 @@ def replay(wanted: Any, fixed: Any, noted: Noted, cotangent: Marched) -> Any:
     rays_mask = is_there(wanted[1])
     zeros = functools.partial(jax.tree.map, jnp.zeros_like)
 
-    def start(inputs: tuple[BackLanes, Marched]) -> _ReplayState:
+    def start(inputs: tuple[BackwardRays, Marched]) -> _ReplayState:
         back, cotangent = inputs
         behind = back.nothing_behind(len(cotangent.radiance), distance=bool(cotangent.distance))
-        return _ReplayState(behind, jnp.zeros_like(back.steps), zeros(eqx.filter(back.lanes.rays, rays_mask)))
+        return _ReplayState(behind, jnp.zeros_like(back.steps), zeros(eqx.filter(back.active.rays, rays_mask)))
 
-    def alive(inputs: tuple[BackLanes, Marched], state: _ReplayState):
+    def alive(inputs: tuple[BackwardRays, Marched], state: _ReplayState):
         return state.j < inputs[0].steps
 
-    def advance(inputs: tuple[BackLanes, Marched], state: _ReplayState, total: _Gradients):
+    def advance(inputs: tuple[BackwardRays, Marched], state: _ReplayState, total: _Gradients):
         return _replay_segment(medium, dt, *inputs, state, total)
 
-    inputs = (BackLanes(lanes_of(rays, dt), *noted), cotangent)
+    inputs = (BackwardRays(active_rays(rays, dt), *noted), cotangent)
     total = _Gradients(zeros(wanted[0]), zeros(wanted[2]))
-    gradient, total = pooled_while(alive, advance, start, lambda state: state.gradient, inputs, total, noted.following)
+    gradient, total = wavefront_while(alive, advance, start, lambda state: state.gradient, inputs, total, noted.following)
     return total.medium, gradient, total.dt
 
 
-def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marched, state: _ReplayState, total: _Gradients):
+def _replay_segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangent: Marched, state: _ReplayState, total: _Gradients):
     state = state._replace(j=back.skip(medium, dt, state.j))
-    lanes, (k, count) = back.lanes, back.at(state.j)
-    count = occupied_count(medium, lanes, dt, k, count)
+    active, (k, count) = back.active, back.at(state.j)
+    count = occupied_count(medium, active, dt, k, count)
     # The field is not among `small`: it deposits its derivative itself, in place, through the tap.
     small_mask = is_there((total.medium.transfer, total.medium.shader, total.medium.shadows, state.gradient, total.dt))
-    small, rest = eqx.partition((medium.transfer, medium.shader, medium.shadows, lanes.rays, dt), small_mask)
+    small, rest = eqx.partition((medium.transfer, medium.shader, medium.shadows, active.rays, dt), small_mask)
 
     def local(small: Any, taps: tuple[Sample, ...]):
         """The segment as a function of what its derivative is wanted for; the taps stand for the field."""
         transfer, shader, shadows, rays, dt = eqx.combine(small, rest)
         extent, u = segment(k, count, rays.length, dt)
-        sampled = places(medium, rays, lanes.ray, k, u, extent)
+        sampled = places(medium, rays, active.ray, k, u, extent)
         samples = jax.tree.map(jnp.add, resample(medium, sampled, k < count), taps)
-        where = Stretch(rays, lanes.ray, k, u, extent, k < count)
+        where = Stretch(rays, active.ray, k, u, extent, k < count)
         # Light moves with the extinction, of which it knows as the shader does.
         moved = medium._replace(transfer=transfer, shader=shader, shadows=shadows)
         samples = lit(moved, where, samples, reverse=True)
-        point = points_at(rays, lanes.ray, k, u)
+        point = points_at(rays, active.ray, k, u)
         looks = jax.vmap(shader.look, in_axes=(None, 0, 0, 0))(transfer, samples, point, extent)
         return (*computed_once(k < count, looks), u), sampled
 
-    (emitted, dtau, u), pull, sampled = jax.vjp(local, small, _no_taps(medium, lanes.rays), has_aux=True)
+    (emitted, dtau, u), pull, sampled = jax.vjp(local, small, _no_taps(medium, active.rays), has_aux=True)
 
     front = back.depth(state.j, state.behind, dtau)
     before = transmittance(*front)

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from jvr.march.batch import pooled_while
 from jvr.march.medium import Medium
-from jvr.march.segments import Lanes, channel_counts, first_visible, lanes_of, occupied_count, skip, take_segment
+from jvr.march.segments import ActiveRays, active_rays, channel_counts, first_visible, occupied_count, skip, take_segment
 from jvr.march.steps import Rays
 from jvr.march.sums import Sums, add_segment, join, opaque_depth
+from jvr.march.wavefront import wavefront_while
 from jvr.types import Channels, Scalar
 
 
@@ -72,24 +72,24 @@ def integrate(
     """What every ray gathered, and where a replay will need it, what that starts from."""
     emits, absorbs = channel_counts(medium, rays, dt)
 
-    def start(inputs: tuple[Lanes, Int[Array, "rays"]]) -> Progress:
-        lanes, following = inputs
-        zero = jnp.zeros_like(lanes.rays.length)
+    def start(inputs: tuple[ActiveRays, Int[Array, "rays"]]) -> Progress:
+        active, following = inputs
+        zero = jnp.zeros_like(active.rays.length)
         blank = (zero,) * absorbs
         sums = Sums((zero,) * emits, (zero,) * emits, blank, blank, blank * options.distance)
-        none = jnp.zeros_like(lanes.segments)
+        none = jnp.zeros_like(active.segments)
         return Progress(sums, following, none, blank * for_replay, (none,) * absorbs * for_replay)
 
-    def alive(inputs: tuple[Lanes, Int[Array, "rays"]], progress: Progress) -> Bool[Array, "rays"]:
+    def alive(inputs: tuple[ActiveRays, Int[Array, "rays"]], progress: Progress) -> Bool[Array, "rays"]:
         return is_alive(options, inputs[0], progress)
 
-    def advance(inputs: tuple[Lanes, Int[Array, "rays"]], progress: Progress, _: None) -> tuple[Progress, None]:
-        lanes = inputs[0]
-        k = jnp.where(is_alive(options, lanes, progress), skip(medium, lanes, dt, progress.following), progress.following)
+    def advance(inputs: tuple[ActiveRays, Int[Array, "rays"]], progress: Progress, _: None) -> tuple[Progress, None]:
+        active = inputs[0]
+        k = jnp.where(is_alive(options, active, progress), skip(medium, active, dt, progress.following), progress.following)
         skipped, progress = k > progress.following, progress._replace(following=k)
-        alive = is_alive(options, lanes, progress)
+        alive = is_alive(options, active, progress)
         emitted, dtau, u = take_segment(
-            medium, lanes, dt, k, occupied_count(medium, lanes, dt, k, jnp.where(alive, lanes.segments, 0))
+            medium, active, dt, k, occupied_count(medium, active, dt, k, jnp.where(alive, active.segments, 0))
         )
         # Where a ray ends with a skip, the last segment that it skipped is the one to be noted.
         front, last = note_front(progress, alive | skipped, k - ~alive) if for_replay else ((), ())
@@ -100,15 +100,15 @@ def integrate(
         noted = Noted(progress.following, progress.front, progress.last) if for_replay else None
         return marched(progress), noted
 
-    lanes = lanes_of(rays, dt)
-    first = first_visible(medium, lanes, dt)
-    work = lanes.segments - first
-    gathered, noted = pooled_while(alive, advance, start, finish, (lanes, first), None, work)[0]
+    active = active_rays(rays, dt)
+    first = first_visible(medium, active, dt)
+    work = active.segments - first
+    gathered, noted = wavefront_while(alive, advance, start, finish, (active, first), None, work)[0]
     if noted is not None:
         # Rays without work were not started; a replay that skips nothing still has all of their segments to look at.
         blank = work == 0
-        last = tuple(jnp.where(blank, lanes.segments - 1, x) for x in noted.last)
-        noted = noted._replace(following=jnp.where(blank, lanes.segments, noted.following), last=last)
+        last = tuple(jnp.where(blank, active.segments - 1, x) for x in noted.last)
+        noted = noted._replace(following=jnp.where(blank, active.segments, noted.following), last=last)
     return gathered, noted
 
 
@@ -127,9 +127,9 @@ def marched(progress: Progress) -> Marched:
     return Marched(join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), sums.distance, progress.steps)
 
 
-def is_alive(options: MarchOptions, lanes: Lanes, progress: Progress) -> Bool[Array, "rays"]:
+def is_alive(options: MarchOptions, active: ActiveRays, progress: Progress) -> Bool[Array, "rays"]:
     """Whether the next segment of each ray is to be taken: it lies inside, and something of it can still reach the eye."""
-    alive = progress.following < lanes.segments
+    alive = progress.following < active.segments
     if progress.sums.tau:
         thinnest = functools.reduce(jnp.minimum, progress.sums.tau)
         # Even without a bound: behind so much nothing can be seen.

@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.adjoint import BackLanes, Behind, segment_cotangents, step_back
-from jvr.march.batch import pooled_while
+from jvr.march.adjoint import BackwardRays, Behind, segment_cotangents, step_back
 from jvr.march.march import Marched, MarchOptions, integrate
 from jvr.march.medium import Medium, for_derivatives
-from jvr.march.segments import Stretch, lanes_of, light_at, occupied_count
+from jvr.march.segments import Stretch, active_rays, light_at, occupied_count
 from jvr.march.shaders import where_known
 from jvr.march.steps import Rays, points_at, segment
 from jvr.march.sums import transmittance
+from jvr.march.wavefront import wavefront_while
 from jvr.model.transfer import AbstractTable, Classified
 from jvr.types import Channels, Scalar
 
@@ -68,15 +68,15 @@ def table_rows(
     n = medium.transfer.rgb.shape[0]
     emits, absorbs = len(gathered.radiance), len(noted.front)
 
-    def start(back: BackLanes) -> _RowState:
+    def start(back: BackwardRays) -> _RowState:
         zero = jnp.zeros((back.steps.size, n), rays.length.dtype)
         rows = TableRows((zero,) * emits, (zero,) * emits * of_extinctions, (zero,) * absorbs * of_extinctions)
         return _RowState(back.nothing_behind(emits, distance=False), jnp.zeros_like(back.steps), rows)
 
-    def alive(back: BackLanes, state: _RowState):
+    def alive(back: BackwardRays, state: _RowState):
         return state.j < back.steps
 
-    def advance(back: BackLanes, state: _RowState, _: None) -> tuple[_RowState, None]:
+    def advance(back: BackwardRays, state: _RowState, _: None) -> tuple[_RowState, None]:
         one = lambda carry, _: _row_segment(medium, dt, back, of_extinctions, *carry)
         (behind, j), (u, weights) = jax.lax.scan(one, (state.behind, state.j), length=BLOCK)
         entry = jnp.arange(n, dtype=u.dtype)
@@ -84,22 +84,22 @@ def table_rows(
         rows = jax.tree.map(lambda row, w: row + sum(hats[i] * w[i][:, None] for i in range(BLOCK)), state.rows, weights)
         return _RowState(behind, j, rows), None
 
-    back = BackLanes(lanes_of(rays, dt), *noted)
-    rows, _ = pooled_while(alive, advance, start, lambda state: state.rows, back, None, noted.following)
+    back = BackwardRays(active_rays(rays, dt), *noted)
+    rows, _ = wavefront_while(alive, advance, start, lambda state: state.rows, back, None, noted.following)
     return gathered, rows
 
 
-def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, of_extinctions: bool, behind: Behind, j: Int[Array, "rays"]):
+def _row_segment(medium: Medium, dt: Scalar, back: BackwardRays, of_extinctions: bool, behind: Behind, j: Int[Array, "rays"]):
     """One segment of every ray: the state before it, where its samples fall in the table, and the weights of their hats."""
     j = back.skip(medium, dt, j)
-    lanes, (k, count) = back.lanes, back.at(j)
-    count = occupied_count(medium, lanes, dt, k, count)
-    extent, distance = segment(k, count, lanes.rays.length, dt)
-    points = points_at(lanes.rays, lanes.ray, k, distance)
+    active, (k, count) = back.active, back.at(j)
+    count = occupied_count(medium, active, dt, k, count)
+    extent, distance = segment(k, count, active.rays.length, dt)
+    points = points_at(active.rays, active.ray, k, distance)
     samples = jax.vmap(medium.field.resample)(points)
     samples = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, points)
     classified = jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, samples)
-    where = Stretch(lanes.rays, lanes.ray, k, distance, extent, k < count)
+    where = Stretch(active.rays, active.ray, k, distance, extent, k < count)
 
     def seen(classified: Classified) -> tuple[Channels, Channels]:
         # Where in the segment the light is looked up depends on its extinction; the light itself does not.

@@ -18,8 +18,8 @@ from jvr.types import Channels, Scalar
 FIRST_SKIPS = 8
 
 
-class Lanes(NamedTuple):
-    """A batch of rays: their indices in the whole batch and their numbers of segments."""
+class ActiveRays(NamedTuple):
+    """Rays of a wavefront: their indices in the whole batch and their numbers of segments."""
 
     rays: Rays
     ray: Int[Array, "rays"]
@@ -37,49 +37,49 @@ class Stretch(NamedTuple):
     inside: Bool[Array, "rays"]
 
 
-def lanes_of(rays: Rays, dt: Scalar) -> Lanes:
+def active_rays(rays: Rays, dt: Scalar) -> ActiveRays:
     """All rays, numbered."""
     count = segment_count(rays.length, dt)
-    return Lanes(rays, jnp.arange(count.size, dtype=jnp.int32), count)
+    return ActiveRays(rays, jnp.arange(count.size, dtype=jnp.int32), count)
 
 
-def skip(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"]) -> Int[Array, "rays"]:
+def skip(medium: Medium, active: ActiveRays, dt: Scalar, k: Int[Array, "rays"]) -> Int[Array, "rays"]:
     """The next segment, from `k` on, that may have a sample in a visible brick, or the number of segments."""
     if medium.occupancy is None:
         return k
-    extent, u = segment(k, lanes.segments, lanes.rays.length, dt)
+    extent, u = segment(k, active.segments, active.rays.length, dt)
     within = len(medium.shader.places) > 1
     first = u - extent / 2 if within else u
-    return jnp.minimum(k + medium.occupancy.skip(lanes.rays, first, dt, within=within), lanes.segments)
+    return jnp.minimum(k + medium.occupancy.skip(active.rays, first, dt, within=within), active.segments)
 
 
-def first_visible(medium: Medium, lanes: Lanes, dt: Scalar) -> Int[Array, "rays"]:
+def first_visible(medium: Medium, active: ActiveRays, dt: Scalar) -> Int[Array, "rays"]:
     """The segment that each ray starts with: a few skips on from its entry. Most of the rays that see nothing end here, and what is
     left of the others says better how long they will take."""
-    first = jnp.zeros_like(lanes.segments)
+    first = jnp.zeros_like(active.segments)
     if medium.occupancy is None:
         return first
-    return jax.lax.fori_loop(0, FIRST_SKIPS, lambda _, k: skip(medium, lanes, dt, k), first)
+    return jax.lax.fori_loop(0, FIRST_SKIPS, lambda _, k: skip(medium, active, dt, k), first)
 
 
 def occupied_count(
-    medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]
+    medium: Medium, active: ActiveRays, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]
 ) -> Int[Array, "rays"]:
     """`count`, the number of segments, and 0 for rays whose segment `k` is not to be seen. A skip may end in another empty brick; where
     empty means negligible, both directions have to take the same segments."""
     if medium.occupancy is None or not medium.occupancy.is_bounded:
         return count
-    _, u = segment(k, count, lanes.rays.length, dt)
-    return jnp.where(medium.occupancy.is_occupied(lanes.rays, u), count, 0)
+    _, u = segment(k, count, active.rays.length, dt)
+    return jnp.where(medium.occupancy.is_occupied(active.rays, u), count, 0)
 
 
-def take_segment(medium: Medium, lanes: Lanes, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
+def take_segment(medium: Medium, active: ActiveRays, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
     """Emission and optical depth of segment `k` of every ray, and the distance of its midpoint; zero beyond `count`."""
-    extent, u = segment(k, count, lanes.rays.length, dt)
-    sampled = places(medium, lanes.rays, lanes.ray, k, u, extent)
-    where = Stretch(lanes.rays, lanes.ray, k, u, extent, k < count)
+    extent, u = segment(k, count, active.rays.length, dt)
+    sampled = places(medium, active.rays, active.ray, k, u, extent)
+    where = Stretch(active.rays, active.ray, k, u, extent, k < count)
     samples = lit(medium, where, resample(medium, sampled, k < count), reverse=False)
-    point = points_at(lanes.rays, lanes.ray, k, u)
+    point = points_at(active.rays, active.ray, k, u)
     emitted, dtau = jax.vmap(medium.shader.look, in_axes=(None, 0, 0, 0))(medium.transfer, samples, point, extent)
     return emitted, dtau, u
 
@@ -153,6 +153,6 @@ def light_at(
 
 def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:
     """How many channels the medium emits and absorbs in, by shape alone."""
-    one = lanes_of(jax.tree.map(lambda x: x[:1], rays), dt)
+    one = active_rays(jax.tree.map(lambda x: x[:1], rays), dt)
     emitted, dtau, _ = jax.eval_shape(lambda: take_segment(medium, one, dt, jnp.zeros_like(one.segments), one.segments))
     return len(emitted), len(dtau)

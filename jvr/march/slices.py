@@ -273,7 +273,7 @@ def _parents(fine: Bool[Array, "h w"]) -> Bool[Array, "h2 w2"]:
     return padded
 
 
-def position(rows: Float[Array, "lanes 8"], k: Int[Array, ""], dt: Scalar, shape: tuple[int, int, int]) -> Triple:
+def position(rows: Float[Array, "block 8"], k: Int[Array, ""], dt: Scalar, shape: tuple[int, int, int]) -> Triple:
     """Grid positions of samples on slice `k`, clamped to where each ray is inside."""
     u = distance(rows, k, dt)
     p = [rows[:, i] + u * rows[:, 3 + i] for i in range(3)]
@@ -283,7 +283,7 @@ def position(rows: Float[Array, "lanes 8"], k: Int[Array, ""], dt: Scalar, shape
     return tuple(rounded_into(x, low, high) for x, (low, high) in zip(p, bounds, strict=True))
 
 
-def distance(rows: Float[Array, "lanes 8"], k: Array, dt: Scalar) -> Float[Array, "lanes"]:
+def distance(rows: Float[Array, "block 8"], k: Array, dt: Scalar) -> Float[Array, "block"]:
     """`u` on slice `k`."""
     return smaller(larger(rows[:, 6] + k * dt, 0.0), rows[:, 7])
 

@@ -98,10 +98,10 @@ def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
     return scene.transfer
 
 
-def _segment(shading: Any, lanes: tuple[Array, Array, Array]) -> tuple[Channels, Channels]:
+def _segment(shading: Any, segments: tuple[Array, Array, Array]) -> tuple[Channels, Channels]:
     """Radiance and optical depth of segments along which the scalar changes linearly."""
     table, optical = shading
-    return jax.vmap(lambda front, back, length: table.segment(optical, front, back, length))(*lanes)
+    return jax.vmap(lambda front, back, length: table.segment(optical, front, back, length))(*segments)
 
 
 def _farthest(scene: Scene, sampling: Slices, options: SliceOptions, lattice: Lattice, dt: Scalar) -> Scalar:
