@@ -252,8 +252,8 @@ FIT = FIT.replace("PLAIN", 'kind = "linear"\npositions = [0, 1]\nrgb = [[1, 1, 1
 TRANSFER = "radiance_transfer={rays=4,resolution=0.1,scattering='skin1'}"
 
 
-def job(unknowns, *sets, prepare=jvr.precompute):
-    return build_fit(config(f"{FIT}[fit]\nunknowns = {unknowns}\n", *sets), prepare=prepare)
+def job(unknowns, *sets, precompute=jvr.precompute):
+    return build_fit(config(f"{FIT}[fit]\nunknowns = {unknowns}\n", *sets), precompute=precompute)
 
 
 def asked_for(unknowns, *sets):
@@ -264,7 +264,7 @@ def asked_for(unknowns, *sets):
         calls.append((scene, keywords))
         return scene
 
-    found = job(unknowns, TRANSFER, *sets, prepare=note)
+    found = job(unknowns, TRANSFER, *sets, precompute=note)
     scene, keywords = calls[0]
     return scene.radiance_transfer is not None, keywords["keep_material"], keywords["keep_unscattered"], found
 

@@ -10,7 +10,7 @@ import pytest
 from scenes import compiled
 
 import jvr
-from jvr.fitting.objective import Problem, has_rows, march_unknowns, normal_equations, prepared, value
+from jvr.fitting.objective import Problem, has_rows, light_tangents, march_unknowns, normal_equations, value
 from jvr.fitting.observations import observe
 from jvr.fitting.unknowns import Exposed, choose_unknowns
 
@@ -166,7 +166,7 @@ def both_ways(one, unknowns):
     cameras, images = views(scene(one.volume, sigma=0.3))
     observations = observe(one, cameras, images, None, SETTINGS).dealt(128)
     total = jnp.asarray(3.0 * observations.size)
-    around = prepared(problem, values)
+    around = light_tangents(problem, values)
     vectors = [normal_equations(problem, values, piece, around).vector for piece in observations.pieces(128)]
     # On the real line every value is itself.
     identity = eqx.tree_at(lambda p: p.unknowns.transforms, problem, tuple(jvr.Identity() for _ in problem.unknowns.transforms))

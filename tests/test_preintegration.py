@@ -56,8 +56,8 @@ def references(table, s0, s1, dt):
 
 def all_models(table, s0, s1, dt, parts=1):
     """Emission of the two models that emit and optical depth of the two that absorb, a row for each segment."""
-    prepared = PreIntegratedTable(table, parts)
-    both = [jax.vmap(lambda a, b, d, m=m: prepared.segment(m, a, b, d))(s0, s1, dt) for m in MODELS]
+    integrated = PreIntegratedTable(table, parts)
+    both = [jax.vmap(lambda a, b, d, m=m: integrated.segment(m, a, b, d))(s0, s1, dt) for m in MODELS]
     assert both[1][1] == both[2][0] == ()
     column = lambda channels: jnp.stack(jnp.broadcast_arrays(*(channels * (3 // len(channels)))), axis=1)
     return column(both[0][0]), column(both[1][0]), column(both[0][1]), column(both[2][1])

@@ -43,7 +43,7 @@ def fit_scene(config: Config, folder: Path, *, resume: bool = False, force: bool
             whole.enter_context(alone_in(folder))
         with reading(), progress("reading the volume and the target images"):
             check_results(folder, inputs_of(config), resume=resume, force=force)
-            job = build_fit(config, prepare=beforehand)
+            job = build_fit(config, precompute=beforehand)
         if not is_there:
             folder.mkdir(parents=True, exist_ok=True)
             whole.enter_context(alone_in(folder))

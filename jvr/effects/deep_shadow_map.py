@@ -44,7 +44,7 @@ class DeepShadowMap(AbstractShadows):
             raise ValueError(f"error must be a difference of transmittance above 0 and below 1, not {error!r}")
         self.texels, self.layers, self.error = texels, layers, error
 
-    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         steps = max(self.layers, math.ceil(math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape))))
         maps = []
         for light in lights:

@@ -95,7 +95,7 @@ class LitPreIntegratedShader(LitShader, PreIntegratedShader):
     def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
         emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
-        middle = self.prepare(transfer.table, _mean(front, back), point)
+        middle = self.in_world(transfer.table, _mean(front, back), point)
         factor, added = self.light_at(middle, point, transfer.evaluate(middle.s), dt)
         # A constant colour of the given optical depth.
         extra, _ = self.optical.segment(Classified(added, dtau), jnp.ones_like(dt))

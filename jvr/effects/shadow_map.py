@@ -45,7 +45,7 @@ class ShadowMap(AbstractShadows):
             raise ValueError(f"bias must be a depth in voxels, not negative, not {bias!r}")
         self.texels, self.threshold, self.softness, self.bias = texels, threshold, softness, float(bias)
 
-    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         maps = []
         for light in lights:
             space = light_space(light, scene.volume) if light.casts_shadows else None

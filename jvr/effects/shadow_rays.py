@@ -42,7 +42,7 @@ class ShadowRays(AbstractShadows):
             raise ValueError(f"termination must be a transmittance in [0, 1), not {termination!r}")
         self.step, self.termination = float(step), float(termination)
 
-    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         return RayVisibility(scene.clipping, lights, medium, self.step * spacing, MarchOptions(self.termination, distance=False))
 
     def coarser(self) -> tuple[AbstractShadows, ...]:

@@ -37,7 +37,7 @@ class ShadowVolume(AbstractShadows):
             )
         self.resolution = float(resolution)
 
-    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         diagonal = math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape))
         nodes = max(2, math.ceil(self.resolution * diagonal))
         return depth_visibility(scene, lights, medium, nodes + 1, nodes, math.ceil(0.5 / self.resolution))
@@ -64,7 +64,7 @@ class OpacityShadowMap(AbstractShadows):
         check_size(layers, "layers", 1)
         self.texels, self.layers = texels, layers
 
-    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         return depth_visibility(scene, lights, medium, self.texels, self.layers, samples_a_layer(scene, self.layers))
 
     def coarser(self) -> tuple[AbstractShadows, ...]:

@@ -188,7 +188,7 @@ def prior_expansion(problem: Problem, values: Float[Array, "unknowns"]) -> tuple
     return of_values(values), jax.grad(of_values)(values), jax.hessian(of_values)(values)
 
 
-class Prepared(NamedTuple):
+class LightTangents(NamedTuple):
     """How much light reaches each point, where that takes long and is therefore made once for all chunks: its floating-point arrays, the
     others, and the derivatives of the first in each of the `directions` of `_Kinds` (a leading axis)."""
 
@@ -197,14 +197,14 @@ class Prepared(NamedTuple):
     tangents: Any
 
 
-def prepared(problem: Problem, values: Float[Array, "unknowns"]) -> Prepared | None:
+def light_tangents(problem: Problem, values: Float[Array, "unknowns"]) -> LightTangents | None:
     """What `normal_equations` of all chunks need at one point, or `None` where that is nothing worth keeping."""
     transfer = problem.model.scene.radiance_transfer
-    return None if transfer is None or transfer.is_final else _prepared(problem, values)
+    return None if transfer is None or transfer.is_final else _light_tangents(problem, values)
 
 
 @eqx.filter_jit
-def _prepared(problem: Problem, values: Float[Array, "unknowns"]) -> Prepared:
+def _light_tangents(problem: Problem, values: Float[Array, "unknowns"]) -> LightTangents:
     kinds = _Kinds.of(problem)
 
     def around(part: Array) -> tuple[Any, Any]:
@@ -213,16 +213,16 @@ def _prepared(problem: Problem, values: Float[Array, "unknowns"]) -> Prepared:
 
     part = values[kinds.inner]
     if not part.size:
-        return Prepared(*around(part), None)
+        return LightTangents(*around(part), None)
     along = jax.vmap(lambda direction: jax.jvp(around, (part,), (direction,), has_aux=True), out_axes=(None, 0, None))
     arrays, tangents, rest = along(kinds.basis(values.dtype))
-    return Prepared(arrays, rest, tangents)
+    return LightTangents(arrays, rest, tangents)
 
 
 def normal_equations(
-    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: Prepared | None = None
+    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: LightTangents | None = None
 ) -> Normal:
-    """The sums of `Normal` over one piece of rays, in float64; `around`: what `prepared` returns, else made for this piece alone.
+    """The sums of `Normal` over one piece of rays, in float64; `around`: what `light_tangents` returns, else made for this piece alone.
 
     The rows have the precision of `values`, their products are summed in float64. A matrix summed in float32 is uncertain by 1e-7, and
     already an eigenvalue of 1e-7 is a combination of unknowns that changes the images by 3e-4 of what a single one does.
@@ -233,17 +233,19 @@ def normal_equations(
 
 
 @eqx.filter_jit
-def _channels(problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: Prepared | None) -> list[_Channel]:
+def _channels(
+    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: LightTangents | None
+) -> list[_Channel]:
     shared, stored = problem.apart()
 
-    def share(shared: tuple[Problem, Array, Prepared | None], rays: tuple[Array | None, Observations]) -> list[_Channel]:
+    def share(shared: tuple[Problem, Array, LightTangents | None], rays: tuple[Array | None, Observations]) -> list[_Channel]:
         return _share_of_channels(shared[0].whole(rays[0]), shared[1], rays[1], shared[2])
 
     return over_rays(share, (shared, values, around), (stored, piece))
 
 
 def _share_of_channels(
-    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: Prepared | None
+    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: LightTangents | None
 ) -> list[_Channel]:
     colours, blocks = _jacobian(problem, values, piece, around)
     channels = []
@@ -272,14 +274,14 @@ def _sums(channels: list[_Channel], n: int) -> Normal:
 
 
 def _jacobian(
-    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: Prepared | None
+    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: LightTangents | None
 ) -> tuple[Triple, list[Blocks]]:
     """Predicted colours of a chunk, and for each channel blocks of its Jacobian with the unknowns that they belong to."""
     kinds = _Kinds.of(problem)
     model = kinds.changed(values[kinds.inner], values)
     options = MarchOptions(problem.settings.termination, distance=False)
     blocks: list[Blocks] = [[], [], []]
-    arrays, rest, tangents = around or Prepared(None, None, None)
+    arrays, rest, tangents = around or LightTangents(None, None, None)
 
     def observed(scene: Scene, arrays: Any) -> tuple[Medium, Rays]:
         visible = None if around is None else eqx.combine(arrays, rest)

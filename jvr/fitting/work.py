@@ -17,8 +17,8 @@ from jvr.fitting.objective import (
     Normal,
     Problem,
     image_value,
+    light_tangents,
     normal_equations,
-    prepared,
     prior_expansion,
     residuals,
     value,
@@ -148,7 +148,7 @@ class Work:
     def _sum(self, values: Float[Array, "unknowns"], observations: Observations, problem: Problem | None = None) -> Normal:
         """The normal equations of all chunks together, in float64."""
         problem = problem or self.problem
-        around = prepared(problem, values)
+        around = light_tangents(problem, values)
         parts = [normal_equations(problem, values, piece, around) for piece in observations.pieces(self.chunk)]
         return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
 

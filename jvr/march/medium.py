@@ -64,15 +64,15 @@ class AbstractShader(eqx.Module):
 
     def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         """The same for a segment around `point`, from what is known at `places`."""
-        sample = self.prepare(transfer, samples[0], point)
+        sample = self.in_world(transfer, samples[0], point)
         return self.segment(self.classify(transfer, sample), sample, point, dt)
 
-    def prepare(self, transfer: Any, sample: Sample, point: Point) -> Sample:
+    def in_world(self, transfer: Any, sample: Sample, point: Point) -> Sample:
         """The sample with its gradient in the world."""
         return sample
 
     def classify(self, transfer: Any, sample: Sample) -> Classified:
-        """Colour and extinction of a prepared sample."""
+        """Colour and extinction of a sample `in_world`."""
         return transfer.evaluate(sample.s)
 
 
@@ -81,7 +81,7 @@ class Medium(NamedTuple):
     is not `None`, each sample knows how much light reaches it."""
 
     field: AbstractField
-    transfer: Any  # what `shader.look` reads: an AbstractTransfer, or one prepared for the shader
+    transfer: Any  # what `shader.look` reads: an AbstractTransfer, or one made for the shader
     shader: AbstractShader
     occupancy: Occupancy | None = None
     shadows: AbstractVisibility | None = None

@@ -97,7 +97,7 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackwardRays, of_extinctions:
     extent, distance = segment(k, count, active.rays.length, dt)
     points = points_at(active.rays, active.ray, k, distance)
     samples = jax.vmap(medium.field.resample)(points)
-    samples = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, points)
+    samples = jax.vmap(medium.shader.in_world, in_axes=(None, 0, 0))(medium.transfer, samples, points)
     classified = jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, samples)
     where = Stretch(active.rays, active.ray, k, distance, extent, k < count)
 

@@ -111,8 +111,8 @@ def _known(medium: Medium, points: Point, proof: Bool[Array, "rays"]) -> Sample:
 def classify_at(medium: Medium, points: Point, proof: Bool[Array, "points"]) -> tuple[Classified, Sample]:
     """Colour and extinction at a batch of points, and what the shader knows of them; `proof` as in `computed_once`."""
     samples = _known(medium, points, proof)
-    prepared = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, points)
-    return jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, prepared), prepared
+    samples = jax.vmap(medium.shader.in_world, in_axes=(None, 0, 0))(medium.transfer, samples, points)
+    return jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, samples), samples
 
 
 def lit(medium: Medium, where: Stretch, samples: tuple[Sample, ...], *, reverse: bool) -> tuple[Sample, ...]:
@@ -123,7 +123,7 @@ def lit(medium: Medium, where: Stretch, samples: tuple[Sample, ...], *, reverse:
 
     def classify(sample: Sample, point: Point) -> tuple[Channels, Channels]:
         """Extinction, and on the way back how it changes with the scalar."""
-        of = lambda s: shader.classify(medium.transfer, shader.prepare(medium.transfer, sample._replace(s=s), point)).sigma_t
+        of = lambda s: shader.classify(medium.transfer, shader.in_world(medium.transfer, sample._replace(s=s), point)).sigma_t
         return jax.jvp(of, (sample.s,), (jnp.ones_like(sample.s),)) if reverse else (of(sample.s), ())
 
     sigma_t, slopes = zip(*(jax.vmap(classify)(sample, middle) for sample in samples), strict=True)

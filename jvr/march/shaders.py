@@ -61,7 +61,7 @@ class OpticalShader(AbstractShader):
     def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         return self.optical.segment(medium, dt)
 
-    def prepare(self, transfer: Any, sample: Sample, point: Point) -> Sample:
+    def in_world(self, transfer: Any, sample: Sample, point: Point) -> Sample:
         return sample if self.frame is None else self.frame.in_world(transfer, sample, point)
 
     def classify(self, transfer: Any, sample: Sample) -> Classified:

@@ -52,7 +52,7 @@ class AbstractShadows(eqx.Module):
     """A way to find the transmittance between lights and points."""
 
     @abc.abstractmethod
-    def prepared(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
+    def visibility(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
         """A `jvr.march.medium.AbstractVisibility` of these lights, made once for a picture; differentiable. `medium`: what light passes
         through, a `jvr.march.medium.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""
 

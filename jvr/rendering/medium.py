@@ -72,9 +72,9 @@ def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | No
         return None, None
     if scene.normals.of_opacity and scene.transfer.takes_gradient:
         raise ValueError("a transfer function of the gradient needs that of the scalar: set normals=...(of_opacity=False)")
-    normals = scene.normals.prepared(scene.volume, scene.transfer)
+    normals = scene.normals.with_gradients(scene.volume, scene.transfer)
     volume = scene.volume
-    # The arrays that were prepared stay with the field.
+    # The gradients that were computed stay with the field.
     return GradientFrame(eqx.filter(normals, False), volume.axes_inverse, volume.intercept, volume.shape), normals
 
 
@@ -106,7 +106,7 @@ def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility 
     shadows = None
     if scene.shadows is not None:
         medium = absorbing(scene, occupancy, scene.transfer.takes_gradient)
-        shadows = scene.shadows.prepared(scene, arriving_lights(scene), medium, jnp.min(scene.volume.spacing))
+        shadows = scene.shadows.visibility(scene, arriving_lights(scene), medium, jnp.min(scene.volume.spacing))
     if scene.radiance_transfer is None:
         return shadows
     from jvr.effects.transfer_grid import transfer_visibility

@@ -24,7 +24,7 @@ from jvr.model.effects import AbstractMaterial
 from jvr.model.environment import EnvironmentLight
 from jvr.model.scene import Scene, material_order
 
-Prepare = Callable[..., Scene]
+Precompute = Callable[..., Scene]
 
 
 def natural_parts(config: Config) -> dict[str, Any]:
@@ -64,13 +64,13 @@ def _shapes_transfer(table: RadianceTransferTable) -> tuple[str, ...]:
     return ("transfer", "volume", "clipping", *(["material"] if table.bleeding == "material" else []))
 
 
-def fit_scene(config: Config, scene: Scene, prepare: Prepare) -> Scene:
+def fit_scene(config: Config, scene: Scene, precompute: Precompute) -> Scene:
     """The scene that a fit starts from, with all computed beforehand that the fit does not change, or keeps as it is at its start."""
     keep = {"keep_material": _fits(config, "material"), "keep_unscattered": _fits(config, "radiance_transfer")}
     transfer, table = scene.radiance_transfer, config.tables.radiance_transfer
     if table is None or table.frozen or not _fits(config, *_shapes_transfer(table)):
-        return prepare(scene, **keep)
-    return dataclasses.replace(prepare(dataclasses.replace(scene, radiance_transfer=None), **keep), radiance_transfer=transfer)
+        return precompute(scene, **keep)
+    return dataclasses.replace(precompute(dataclasses.replace(scene, radiance_transfer=None), **keep), radiance_transfer=transfer)
 
 
 def _fits(config: Config, *parts: str) -> bool:
