@@ -14,7 +14,7 @@ from jvr.march.march import MarchOptions
 from jvr.march.occupancy import RADII, occupancy_of
 from jvr.march.rows import table_rows
 from jvr.model.bricks import bricks_of
-from jvr.rendering.trace import aim, seen
+from jvr.rendering.trace import camera_rays, prepare
 
 SHAPES = [(9, 9, 9), (13, 6, 17), (1, 12, 10), (2, 3, 5), (1, 1, 1)]
 
@@ -208,14 +208,14 @@ def test_gradient_where_matter_begins_is_the_same(x64):
 
 
 def test_rows_are_the_same(x64):
-    """Those of extinctions skip nothing; those of colours, alone, over what is empty."""
+    """Those of extinctions skip nothing; those of colours, alone, what is empty."""
     volume, transfer = scene_of(np.random.default_rng(2), (9, 8, 11), float, 1.0)
     scene, camera = jvr.Scene(volume.bricked(2), transfer), perspective(volume, 6, 5)
 
     def rows(skipping, of_extinctions):
         choices = jvr.Settings(0.6, skipping=skipping)
-        aimed, _ = aim(scene, camera, choices, jnp.arange(30, dtype=jnp.int32), seen(scene, choices))
-        return table_rows(MarchOptions(0.0, False), *aimed, of_extinctions=of_extinctions)[1]
+        of_camera, _ = camera_rays(scene, camera, choices, jnp.arange(30, dtype=jnp.int32), prepare(scene, choices))
+        return table_rows(MarchOptions(0.0, False), *of_camera, of_extinctions=of_extinctions)[1]
 
     exact, everything, colours = (compiled(lambda o=o: rows(*o))() for o in ((False, True), (True, True), (True, False)))
     compare = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)

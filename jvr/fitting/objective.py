@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from jvr.execution.devices import everywhere, over_rays, shares
 from jvr.execution.tiles import dealt_blocks, picture_of, pixels_of
 from jvr.fitting.losses import AbstractPrior, SquaredError
-from jvr.fitting.observations import Observations, Samples, observed_medium, seen_in_fit
+from jvr.fitting.observations import Observations, Samples, observed_medium, prepare_in_fit
 from jvr.fitting.unknowns import Exposed, Unknowns
 from jvr.march.differentiation import AbstractAdjoint, Forward, Replay, Rows
 from jvr.march.march import Marched, MarchOptions
@@ -27,7 +27,7 @@ from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
 from jvr.rendering.medium import needs_gradient
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Seen, composite, step_length, trace
+from jvr.rendering.trace import Prepared, composite, step_length, trace
 from jvr.types import Image, Scalar, Triple
 
 
@@ -98,20 +98,20 @@ def predict(problem: Problem, model: Exposed, gathered: Marched, length: Float[A
 def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Scalar:
     """Mean loss over all pixels plus priors, as a function of the unknowns on the real line. `pieces` has a leading axis of chunks."""
     model = problem.unknowns.model_from_real(problem.model, real)
-    seen = seen_in_fit(model.scene, problem.settings, problem.skips)
+    prepared = prepare_in_fit(model.scene, problem.settings, problem.skips)
     shared, stored = problem.apart()
 
-    def share(shared: tuple[Problem, Exposed, Seen], rays: tuple[Array | None, Observations]) -> Array:
-        problem, model, seen = shared
+    def share(shared: tuple[Problem, Exposed, Prepared], rays: tuple[Array | None, Observations]) -> Array:
+        problem, model, prepared = shared
         stored, pieces = rays
 
         def add_piece(sum_: Scalar, piece: Observations) -> tuple[Scalar, None]:
-            r = residual(problem.whole(stored), model, piece, seen)
+            r = residual(problem.whole(stored), model, piece, prepared)
             return sum_ + sum(jnp.sum(piece.weight * problem.loss.value(c)) for c in r), None
 
         return jax.lax.scan(add_piece, jnp.zeros((), real.dtype), pieces)[0][None]
 
-    loss = jnp.sum(over_rays(share, (shared, model, seen), (stored, pieces)))
+    loss = jnp.sum(over_rays(share, (shared, model, prepared), (stored, pieces)))
     return loss / total + prior(problem, model)
 
 
@@ -119,25 +119,27 @@ def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations
 def residuals(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Array:
     """The whole residual vector, scaled to a squared length of the mean squared error; priors have no residuals."""
     model = problem.unknowns.model_from_real(problem.model, real)
-    adjoint, seen = adjoint_of(problem), seen_in_fit(model.scene, problem.settings, problem.skips)
+    adjoint, prepared = adjoint_of(problem), prepare_in_fit(model.scene, problem.settings, problem.skips)
     shared, stored = problem.apart()
 
-    def share(shared: tuple[Problem, Exposed, Seen, Scalar], rays: tuple[Array | None, Observations]) -> Array:
-        problem, model, seen, total = shared
+    def share(shared: tuple[Problem, Exposed, Prepared, Scalar], rays: tuple[Array | None, Observations]) -> Array:
+        problem, model, prepared, total = shared
         stored, pieces = rays
 
         def of_piece(piece: Observations) -> Array:
             scale = jnp.sqrt(piece.weight / total)
-            return jnp.stack([scale * c for c in residual(problem.whole(stored), model, piece, seen, adjoint)])
+            return jnp.stack([scale * c for c in residual(problem.whole(stored), model, piece, prepared, adjoint)])
 
         return jax.lax.map(of_piece, pieces)
 
-    return jnp.ravel(everywhere(over_rays(share, (shared, model, seen, total), (stored, pieces))))
+    return jnp.ravel(everywhere(over_rays(share, (shared, model, prepared, total), (stored, pieces))))
 
 
-def residual(problem: Problem, model: Exposed, piece: Observations, seen: Seen, adjoint: AbstractAdjoint = Replay()) -> Triple:
+def residual(
+    problem: Problem, model: Exposed, piece: Observations, prepared: Prepared, adjoint: AbstractAdjoint = Replay()
+) -> Triple:
     """Rendered minus target in each channel, differentiable in the mode of `adjoint`."""
-    medium, rays = observed_medium(model.scene, piece, problem.samples, problem.settings, seen)
+    medium, rays = observed_medium(model.scene, piece, problem.samples, problem.settings, prepared)
     options = MarchOptions(problem.settings.termination, distance=False)
     gathered = adjoint.march(options, medium, rays, step_length(model.scene, problem.settings))
     colours = predict(problem, model, gathered, rays.length)
@@ -151,23 +153,23 @@ def image_value(
     """`value` for a loss over whole images: the mean over images plus priors."""
     model = problem.unknowns.model_from_real(problem.model, real)
     settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
-    losses, where = [], seen_in_fit(model.scene, settings, problem.skips)
+    losses, prepared = [], prepare_in_fit(model.scene, settings, problem.skips)
     for camera, target in zip(cameras, images, strict=True):
-        rendered = _rendered(problem, model, camera, settings, where)
+        rendered = _rendered(problem, model, camera, settings, prepared)
         losses.append(problem.loss.image(rendered, target))
     return jnp.mean(jnp.stack(losses)) + prior(problem, model)
 
 
-def _rendered(problem: Problem, model: Exposed, camera: AbstractCamera, settings: Settings, seen: Seen) -> Image:
+def _rendered(problem: Problem, model: Exposed, camera: AbstractCamera, settings: Settings, prepared: Prepared) -> Image:
     """A whole image, colours as the targets have them."""
     height, width = camera.height, camera.width
 
-    def share(shared: tuple[Problem, Exposed, AbstractCamera, Seen], blocks: Int[Array, "blocks"]) -> Float[Array, "rays 3"]:
-        problem, model, camera, seen = shared
-        gathered, rays, _ = trace(model.scene, camera, settings, pixels_of(blocks, height, width), where=seen)
+    def share(shared: tuple[Problem, Exposed, AbstractCamera, Prepared], blocks: Int[Array, "blocks"]) -> Float[Array, "rays 3"]:
+        problem, model, camera, prepared = shared
+        gathered, rays, _ = trace(model.scene, camera, settings, pixels_of(blocks, height, width), prepared=prepared)
         return jnp.stack(predict(problem, model, gathered, rays.length), axis=-1)
 
-    shared = (problem.apart()[0], model, camera, seen)
+    shared = (problem.apart()[0], model, camera, prepared)
     rays = everywhere(over_rays(share, shared, dealt_blocks(height, width, shares())))
     return picture_of(rays, height, width, shares())
 
@@ -208,8 +210,8 @@ def _light_tangents(problem: Problem, values: Float[Array, "unknowns"]) -> Light
     kinds = _Kinds.of(problem)
 
     def around(part: Array) -> tuple[Any, Any]:
-        seen = seen_in_fit(kinds.changed(part, values).scene, problem.settings, problem.skips)
-        return eqx.partition(seen.shadows, eqx.is_inexact_array)
+        prepared = prepare_in_fit(kinds.changed(part, values).scene, problem.settings, problem.skips)
+        return eqx.partition(prepared.shadows, eqx.is_inexact_array)
 
     part = values[kinds.inner]
     if not part.size:
@@ -285,8 +287,8 @@ def _jacobian(
 
     def observed(scene: Scene, arrays: Any) -> tuple[Medium, Rays]:
         visible = None if around is None else eqx.combine(arrays, rest)
-        seen = seen_in_fit(scene, problem.settings, problem.skips, visible)
-        return observed_medium(scene, piece, problem.samples, problem.settings, seen)
+        prepared = prepare_in_fit(scene, problem.settings, problem.skips, visible)
+        return observed_medium(scene, piece, problem.samples, problem.settings, prepared)
 
     def of_inner(part: Array, arrays: Any) -> tuple[Triple, Marched]:
         changed = kinds.changed(part, values)

@@ -24,7 +24,7 @@ from jvr.pictures import as_radiance
 from jvr.rendering.medium import medium, natural, occupancy, visibility
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Seen, ahead, enter, near_volume, step_length
+from jvr.rendering.trace import Prepared, ahead, enter, near_volume, step_length
 from jvr.types import Triple
 
 
@@ -222,26 +222,26 @@ def _kept_range(scene: Scene, clamped: bool) -> tuple[Float[Array, ""], Float[Ar
     return low, high
 
 
-def seen_in_fit(scene: Scene, settings: Settings, skips: bool, visible: AbstractVisibility | None = None) -> Seen:
+def prepare_in_fit(scene: Scene, settings: Settings, skips: bool, visible: AbstractVisibility | None = None) -> Prepared:
     """What is computed once for all rays; `skips`: whether rays skip empty bricks although nothing else is negligible; `visible`: how
     much light reaches a point, where that is known."""
     (scene,) = near_volume(scene)
-    where = occupancy(scene, settings) if settings.negligible or skips else None
-    return Seen(where, visibility(scene, where) if visible is None else visible, natural(scene))
+    occupied = occupancy(scene, settings) if settings.negligible or skips else None
+    return Prepared(occupied, visibility(scene, occupied) if visible is None else visible, natural(scene))
 
 
 def is_mostly_empty(scene: Scene, settings: Settings) -> bool:
     """Whether rays through a scene are better off with a look at its bricks before each sample: half of them are empty."""
-    where = jax.jit(occupancy, static_argnums=1)(scene, settings)
-    return where is not None and float(jnp.mean(where.empty_radius > 0)) >= 0.5
+    occupied = jax.jit(occupancy, static_argnums=1)(scene, settings)
+    return occupied is not None and float(jnp.mean(occupied.empty_radius > 0)) >= 0.5
 
 
 def observed_medium(
-    scene: Scene, piece: Observations, samples: Samples | None, settings: Settings, seen: Seen
+    scene: Scene, piece: Observations, samples: Samples | None, settings: Settings, prepared: Prepared
 ) -> tuple[Medium, Rays]:
     """What the rays of a piece march through, resampled anew or from kept samples, and the rays inside of it."""
     rays = _inside(scene, piece)
-    through = medium(near_volume(scene)[0], settings, *seen)
+    through = medium(near_volume(scene)[0], settings, *prepared)
     if samples is not None:
         through = through._replace(field=samples.along(piece.start))
     return through, rays

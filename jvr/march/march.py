@@ -49,8 +49,8 @@ class Progress(NamedTuple):
     last: tuple[Int[Array, "rays"], ...]
 
 
-class Noted(NamedTuple):
-    """What a replay needs of a ray's `Progress` at its end."""
+class ReplayRecord(NamedTuple):
+    """The record that a replay starts from: what it needs of a ray's `Progress` at its end."""
 
     following: Int[Array, "rays"]
     front: Channels
@@ -68,7 +68,7 @@ def march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marc
 
 def integrate(
     options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar, *, for_replay: bool = False
-) -> tuple[Marched, Noted | None]:
+) -> tuple[Marched, ReplayRecord | None]:
     """What every ray gathered, and where a replay will need it, what that starts from."""
     emits, absorbs = channel_counts(medium, rays, dt)
 
@@ -91,28 +91,28 @@ def integrate(
         emitted, dtau, u = take_segment(
             medium, active, dt, k, occupied_count(medium, active, dt, k, jnp.where(alive, active.segments, 0))
         )
-        # Where a ray ends with a skip, the last segment that it skipped is the one to be noted.
-        front, last = note_front(progress, alive | skipped, k - ~alive) if for_replay else ((), ())
+        # Where a ray ends with a skip, the last segment that it skipped is the one to be recorded.
+        front, last = record_front(progress, alive | skipped, k - ~alive) if for_replay else ((), ())
         sums = add_segment(progress.sums, emitted, dtau, u)
         return Progress(sums, k + alive, progress.steps + alive, front, last), None
 
-    def finish(progress: Progress) -> tuple[Marched, Noted | None]:
-        noted = Noted(progress.following, progress.front, progress.last) if for_replay else None
-        return marched(progress), noted
+    def finish(progress: Progress) -> tuple[Marched, ReplayRecord | None]:
+        record = ReplayRecord(progress.following, progress.front, progress.last) if for_replay else None
+        return marched(progress), record
 
     active = active_rays(rays, dt)
     first = first_visible(medium, active, dt)
     work = active.segments - first
-    gathered, noted = wavefront_while(alive, advance, start, finish, (active, first), None, work)[0]
-    if noted is not None:
+    gathered, record = wavefront_while(alive, advance, start, finish, (active, first), None, work)[0]
+    if record is not None:
         # Rays without work were not started; a replay that skips nothing still has all of their segments to look at.
         blank = work == 0
-        last = tuple(jnp.where(blank, active.segments - 1, x) for x in noted.last)
-        noted = noted._replace(following=jnp.where(blank, active.segments, noted.following), last=last)
-    return gathered, noted
+        last = tuple(jnp.where(blank, active.segments - 1, x) for x in record.last)
+        record = record._replace(following=jnp.where(blank, active.segments, record.following), last=last)
+    return gathered, record
 
 
-def note_front(progress: Progress, moved: Bool[Array, "rays"], k: Int[Array, "rays"]):
+def record_front(progress: Progress, moved: Bool[Array, "rays"], k: Int[Array, "rays"]):
     """`front` and `last` as the rays that have `moved` are in front of segment `k`."""
     depth = join(progress.sums.tau, progress.sums.tau_low)
     clear = [moved & (now < opaque_depth(now.dtype)) for now in depth]

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.adjoint import BackwardRays, Behind, segment_cotangents, step_back
+from jvr.march.adjoint import BackwardRays, SuffixRadiance, segment_cotangents, step_back
 from jvr.march.march import Marched, MarchOptions, integrate
 from jvr.march.medium import Medium, for_derivatives
 from jvr.march.segments import Stretch, active_rays, light_at, occupied_count
@@ -46,7 +46,7 @@ class TableRows(NamedTuple):
 
 
 class _RowState(NamedTuple):
-    behind: Behind
+    suffix: SuffixRadiance
     j: Int[Array, "rays"]
     rows: TableRows
 
@@ -59,37 +59,39 @@ def table_rows(
 
     Distances have no rows. Memory: `rays x entries` numbers for each row that `TableRows` lists. Detached as in `march`.
     """
-    gathered, noted = integrate(options, medium, rays, dt, for_replay=True)
+    gathered, record = integrate(options, medium, rays, dt, for_replay=True)
     assert isinstance(medium.transfer, AbstractTable)
-    assert noted is not None
+    assert record is not None
     wanted = jax.tree.map(lambda _: None, medium)
     of_entries = (lambda m: (m.transfer.rgb, m.transfer.sigma_t)) if of_extinctions else lambda m: m.transfer.rgb
     medium = for_derivatives(medium, eqx.tree_at(of_entries, wanted, of_entries(medium), is_leaf=lambda x: x is None))
     n = medium.transfer.rgb.shape[0]
-    emits, absorbs = len(gathered.radiance), len(noted.front)
+    emits, absorbs = len(gathered.radiance), len(record.front)
 
     def start(back: BackwardRays) -> _RowState:
         zero = jnp.zeros((back.steps.size, n), rays.length.dtype)
         rows = TableRows((zero,) * emits, (zero,) * emits * of_extinctions, (zero,) * absorbs * of_extinctions)
-        return _RowState(back.nothing_behind(emits, distance=False), jnp.zeros_like(back.steps), rows)
+        return _RowState(back.empty_suffix(emits, distance=False), jnp.zeros_like(back.steps), rows)
 
     def alive(back: BackwardRays, state: _RowState):
         return state.j < back.steps
 
     def advance(back: BackwardRays, state: _RowState, _: None) -> tuple[_RowState, None]:
         one = lambda carry, _: _row_segment(medium, dt, back, of_extinctions, *carry)
-        (behind, j), (u, weights) = jax.lax.scan(one, (state.behind, state.j), length=BLOCK)
+        (suffix, j), (u, weights) = jax.lax.scan(one, (state.suffix, state.j), length=BLOCK)
         entry = jnp.arange(n, dtype=u.dtype)
         hats = [jnp.maximum(0.0, 1.0 - jnp.abs(u[i][:, None] - entry)) for i in range(BLOCK)]
         rows = jax.tree.map(lambda row, w: row + sum(hats[i] * w[i][:, None] for i in range(BLOCK)), state.rows, weights)
-        return _RowState(behind, j, rows), None
+        return _RowState(suffix, j, rows), None
 
-    back = BackwardRays(active_rays(rays, dt), *noted)
-    rows, _ = wavefront_while(alive, advance, start, lambda state: state.rows, back, None, noted.following)
+    back = BackwardRays(active_rays(rays, dt), *record)
+    rows, _ = wavefront_while(alive, advance, start, lambda state: state.rows, back, None, record.following)
     return gathered, rows
 
 
-def _row_segment(medium: Medium, dt: Scalar, back: BackwardRays, of_extinctions: bool, behind: Behind, j: Int[Array, "rays"]):
+def _row_segment(
+    medium: Medium, dt: Scalar, back: BackwardRays, of_extinctions: bool, suffix: SuffixRadiance, j: Int[Array, "rays"]
+):
     """One segment of every ray: the state before it, where its samples fall in the table, and the weights of their hats."""
     j = back.skip(medium, dt, j)
     active, (k, count) = back.active, back.at(j)
@@ -101,13 +103,13 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackwardRays, of_extinctions:
     classified = jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, samples)
     where = Stretch(active.rays, active.ray, k, distance, extent, k < count)
 
-    def seen(classified: Classified) -> tuple[Channels, Channels]:
+    def radiance_and_depth(classified: Classified) -> tuple[Channels, Channels]:
         # Where in the segment the light is looked up depends on its extinction; the light itself does not.
         light = {} if medium.shadows is None else {"light": light_at(medium, where, classified.sigma_t, reverse=True)}
         return jax.vmap(medium.shader.segment)(classified, samples._replace(**light), points, extent)
 
-    (emitted, dtau), pull = jax.vjp(seen, classified)
-    front = back.depth(j, behind, dtau)
+    (emitted, dtau), pull = jax.vjp(radiance_and_depth, classified)
+    front = back.depth(j, suffix, dtau)
     before = transmittance(*front)
 
     radiance_rgb, radiance_sigma, tau_sigma = [], [], []
@@ -115,7 +117,7 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackwardRays, of_extinctions:
     nothing = Marched((zero,) * len(emitted), (zero,) * len(dtau), (), None)
     for c in range(len(emitted)):
         one = nothing._replace(radiance=_only(nothing.radiance, c))
-        (of_entry,) = pull(segment_cotangents(one, behind, before, dtau, distance)[:2])
+        (of_entry,) = pull(segment_cotangents(one, suffix, before, dtau, distance)[:2])
         radiance_rgb.append(of_entry.rgb[c])
         radiance_sigma.append(of_entry.sigma_t[c % len(of_entry.sigma_t)])
     for c in range(len(dtau) * of_extinctions):
@@ -125,7 +127,7 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackwardRays, of_extinctions:
     weights = jax.tree.map(lambda w: where_known((samples,), (w,))[0], weights)
     assert isinstance(medium.transfer, AbstractTable)
     u = jax.vmap(medium.transfer.coordinate)(samples.s)
-    return (step_back(behind, front, emitted, dtau, distance), j + (j < back.steps)), (u, weights)
+    return (step_back(suffix, front, emitted, dtau, distance), j + (j < back.steps)), (u, weights)
 
 
 def _only(channels: tuple[Array, ...], c: int) -> tuple[Array, ...]:

@@ -24,7 +24,7 @@ from jvr.rendering.medium import is_lit
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Slices, SliceStats
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import ahead, develop, enter, near_volume, step_length
+from jvr.rendering.trace import ahead, enter, near_volume, resolve, step_length
 from jvr.types import Channels, Scalar
 
 # Bricks across which the oracle is asked to look: a picture whose pixels are larger than that is coarser than the volume anyway.
@@ -71,7 +71,7 @@ def render_slices(
     gathered, ended, samples = marched
 
     crop = lambda x: x.reshape(*options.shape(0), *x.shape[1:])[1 : camera.height + 1, 1 : camera.width + 1]
-    pixels, steps = jax.tree.map(crop, (develop(scene, gathered, finest, t_in), gathered.steps))
+    pixels, steps = jax.tree.map(crop, (resolve(scene, gathered, finest, t_in), gathered.steps))
     full = jnp.where(lattice.last >= 0, jnp.minimum(ended, lattice.last) - lattice.first + 1, 0)
     stats = RenderStats(steps, SliceStats(samples, jnp.sum(full, dtype=jnp.int32)))
     return Rendering(pixels.rgb, pixels.alpha, pixels.depth, stats)

@@ -32,7 +32,7 @@ def medium(
     shadows: AbstractVisibility | None = None,
     natural: Any = None,
 ) -> Medium:
-    """What of a scene rays march through: what the scene does not name is not in it. The last three are those of `Seen`."""
+    """What of a scene rays march through: what the scene does not name is not in it. The last three are those of `Prepared`."""
     frame, normals = _gradients(scene)
     field = VoxelField(scene.volume, normals)
     quadrature = settings.quadrature

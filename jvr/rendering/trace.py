@@ -23,7 +23,7 @@ from jvr.types import Scalar, Triple
 FAR = 2.0
 
 
-class Seen(NamedTuple):
+class Prepared(NamedTuple):
     """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under light from
     all around; each `None` where the scene asks for none."""
 
@@ -36,11 +36,11 @@ class Seen(NamedTuple):
         return None if self.shadows is None else self.shadows.stats
 
 
-def seen(scene: Scene, settings: Settings) -> Seen:
-    """What rays through a scene need to know beforehand."""
+def prepare(scene: Scene, settings: Settings) -> Prepared:
+    """What rays through a scene need to know beforehand, computed once."""
     (scene,) = near_volume(scene)
-    where = occupancy(scene, settings)
-    return Seen(where, visibility(scene, where), natural(scene))
+    occupied = occupancy(scene, settings)
+    return Prepared(occupied, visibility(scene, occupied), natural(scene))
 
 
 def trace(
@@ -49,16 +49,16 @@ def trace(
     settings: Settings,
     pixels: Int[Array, "rays"],
     *,
-    where: Seen = Seen(),
+    prepared: Prepared = Prepared(),
     distance: bool = False,
 ) -> tuple[Marched, Rays, Float[Array, "rays"]]:
-    """Marches the rays of some pixels, only `where` there is something to see; returns what they gathered, the rays, and the distance
-    from the eye to their entry."""
-    aimed, t_in = aim(scene, camera, settings, pixels, where)
-    return settings.adjoint.march(MarchOptions(settings.termination, distance), *aimed), aimed.rays, t_in
+    """Marches the rays of some pixels, only where `prepared` leaves something to see; returns what they gathered, the rays, and the
+    distance from the eye to their entry."""
+    of_camera, t_in = camera_rays(scene, camera, settings, pixels, prepared)
+    return settings.adjoint.march(MarchOptions(settings.termination, distance), *of_camera), of_camera.rays, t_in
 
 
-class Aimed(NamedTuple):
+class CameraRays(NamedTuple):
     """What a march takes: what rays go through, the rays, and the length of a segment."""
 
     medium: Medium
@@ -66,13 +66,13 @@ class Aimed(NamedTuple):
     dt: Scalar
 
 
-def aim(
-    scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], where: Seen
-) -> tuple[Aimed, Float[Array, "rays"]]:
+def camera_rays(
+    scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], prepared: Prepared
+) -> tuple[CameraRays, Float[Array, "rays"]]:
     """The rays of some pixels before they are marched, and the distance from the eye to their entry."""
     scene, camera = near_volume(scene, camera)
     rays, t_in = enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)))
-    return Aimed(medium(scene, settings, *where), rays, step_length(scene, settings)), t_in
+    return CameraRays(medium(scene, settings, *prepared), rays, step_length(scene, settings)), t_in
 
 
 def one_precision(scene: Scene, *others: Any) -> Any:
@@ -157,7 +157,7 @@ class Pixels(NamedTuple):
     depth: Float[Array, "rays"]
 
 
-def develop(scene: Scene, gathered: Marched, rays: Rays, t_in: Float[Array, "rays"]) -> Pixels:
+def resolve(scene: Scene, gathered: Marched, rays: Rays, t_in: Float[Array, "rays"]) -> Pixels:
     """The pixels of rays that were marched with their distance."""
     rgb, alpha = composite(scene, gathered, rays.length)
     weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
