@@ -80,7 +80,7 @@ class DeepMap(eqx.Module):
     def transmittance(self, x: Triple) -> Channels:
         """At a world position: along each of the four rays around it, then bilinearly."""
         texels, _, nodes, channels = self.depths.shape
-        u, v, w = self.space.place(x)
+        u, v, w = self.space.coordinates(x)
         depths, clear = self.depths.reshape(-1, channels), self.clear.reshape(-1, channels)
         total = [jnp.zeros_like(u)] * channels
         for texel, weight in bilinear(texels, u, v):

@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float
 from jvr.model.dipole import Dipole
 from jvr.model.volume import Volume
 
-# Places in a node's cell, along each axis, over which the kernel is averaged: it may be narrower than a cell.
-PLACES = 4
+# Quadrature nodes in the cell of a grid node, along each axis, over which the kernel is averaged: it may be narrower than a cell.
+NODES = 4
 
 
 def scatter(
@@ -60,9 +60,9 @@ def kernel_of(dipole: Dipole, radius: float, volume: Volume, shape: tuple[int, .
     length = lambda offset: jnp.linalg.norm(offset @ axes.T, axis=-1)
     side = jnp.max(volume.spacing * (np.asarray(volume.shape) - 1))
     inside = length(jnp.asarray(offsets, axes.dtype)) <= radius * side
-    fractions = np.stack(np.meshgrid(*[(np.arange(PLACES) + 0.5) / PLACES - 0.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    places = offsets[..., None, :] + fractions
-    values = jnp.stack(dipole.reflectance(length(jnp.asarray(places, axes.dtype))))
+    fractions = np.stack(np.meshgrid(*[(np.arange(NODES) + 0.5) / NODES - 0.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    nodes = offsets[..., None, :] + fractions
+    values = jnp.stack(dipole.reflectance(length(jnp.asarray(nodes, axes.dtype))))
     return jnp.where(inside, jnp.mean(values, axis=-1), 0.0)
 
 

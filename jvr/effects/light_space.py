@@ -34,7 +34,7 @@ class AbstractLightSpace(eqx.Module):
     """The coordinates of one light."""
 
     @abc.abstractmethod
-    def place(self, x: Triple) -> Triple:
+    def coordinates(self, x: Triple) -> Triple:
         """`(u, v, w)` of a world position."""
 
     @abc.abstractmethod
@@ -49,7 +49,7 @@ class ParallelSpace(AbstractLightSpace):
     axes: Float[Array, "3 3"]
     half: Vector
 
-    def place(self, x: Triple) -> Triple:
+    def coordinates(self, x: Triple) -> Triple:
         offset = tuple(c - self.center[i] for i, c in enumerate(x))
         u, v, a = (dot(offset, tuple(row)) / self.half[i] for i, row in enumerate(self.axes))
         return u, v, (a + 1) / 2
@@ -71,7 +71,7 @@ class FanSpace(AbstractLightSpace):
     near: Scalar
     far: Scalar
 
-    def place(self, x: Triple) -> Triple:
+    def coordinates(self, x: Triple) -> Triple:
         d, distance = direction_and_length(tuple(c - self.position[i] for i, c in enumerate(x)))
         across, up, along = (dot(d, tuple(row)) for row in self.axes)
         # sin(theta / 2) / sin(theta) = 1 / (2 cos(theta / 2)), smooth about the axis; behind the light `sin(theta / 2)` itself, whose
@@ -166,13 +166,13 @@ def depth_nodes(
     """Optical depth from the light to `layers + 1` equally distant depths of `texels^2` rays, by the midpoint rule with `samples` samples a
     layer, swept away from the light."""
     axis = jnp.linspace(-1.0, 1.0, texels)
-    places = jnp.stack([c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij")], axis=1)
-    places = jnp.pad(places, ((0, -(texels**2) % shares()), (0, 0)), mode="edge")
+    coordinates = jnp.stack([c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij")], axis=1)
+    coordinates = jnp.pad(coordinates, ((0, -(texels**2) % shares()), (0, 0)), mode="edge")
 
-    def share(shared: tuple[AbstractLightSpace, Scene, Medium], places: Float[Array, "rays 2"]) -> Array:
-        return _swept(*shared, places, layers, samples)
+    def share(shared: tuple[AbstractLightSpace, Scene, Medium], coordinates: Float[Array, "rays 2"]) -> Array:
+        return _swept(*shared, coordinates, layers, samples)
 
-    swept = over_rays(share, (space, scene, medium), places)
+    swept = over_rays(share, (space, scene, medium), coordinates)
     return jnp.moveaxis(swept[: texels**2], 1, 0).reshape(layers + 1, texels, texels, -1)
 
 
@@ -180,12 +180,12 @@ def _swept(
     space: AbstractLightSpace,
     scene: Scene,
     medium: Medium,
-    places: Float[Array, "rays 2"],
+    coordinates: Float[Array, "rays 2"],
     layers: int,
     samples: int,
 ) -> Float[Array, "rays nodes channels"]:
-    """`depth_nodes` of the rays in some places `(u, v)`."""
-    u, v = places.T
+    """`depth_nodes` of the rays at some coordinates `(u, v)`."""
+    u, v = coordinates.T
     rays = rays_through(space, scene, u, v)
     together = min(max(1, SWEPT // (u.size * samples)), layers)
     blocks = -(-layers // together)

@@ -92,15 +92,15 @@ class LitShader(OpticalShader):
 class LitPreIntegratedShader(LitShader, PreIntegratedShader):
     """The scalar linear along a segment, the light that of the mean of its ends."""
 
-    def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+    def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
         emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
         middle = self.in_world(transfer.table, _mean(front, back), point)
         factor, added = self.light_at(middle, point, transfer.evaluate(middle.s), dt)
         # A constant colour of the given optical depth.
         extra, _ = self.optical.segment(Classified(added, dtau), jnp.ones_like(dt))
-        look = tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False))
-        return where_known(samples, look), where_known(samples, dtau)
+        radiance = tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False))
+        return where_known(samples, radiance), where_known(samples, dtau)
 
 
 def _mean(front: Sample, back: Sample) -> Sample:

@@ -22,10 +22,10 @@ from jvr.model.transfer import AbstractTransfer, Classified
 from jvr.numerics import dot, mean_depth, smaller
 from jvr.types import Channels, Scalar, Triple
 
-# Where along the normal the extinction is looked at, and what each place counts, as shares of the way: closest to each other near the
-# sample, since what an opaque medium keeps is decided there.
+# Quadrature nodes along the normal that the extinction is looked at, and their weights, as fractions of the way: closest to each other
+# near the sample, since what an opaque medium keeps is decided there.
 _STEPS = (np.arange(4) + 0.5) / 4
-PLACES, WEIGHTS = _STEPS**2.5, _STEPS**1.5 / np.sum(_STEPS**1.5)
+NODES, WEIGHTS = _STEPS**2.5, _STEPS**1.5 / np.sum(_STEPS**1.5)
 
 
 class Segment(NamedTuple):
@@ -74,8 +74,8 @@ class OwnShadow(eqx.Module):
         if self.of_opacity:
             return _ramp(jnp.maximum(sigma + begin, 0.0), slope, width)
         tau = jnp.zeros_like(s)
-        for place, weight in zip(PLACES.tolist(), WEIGHTS.tolist(), strict=True):
-            found = self.transfer.evaluate(s + begin + slope * (width * place), magnitude)
+        for node, weight in zip(NODES.tolist(), WEIGHTS.tolist(), strict=True):
+            found = self.transfer.evaluate(s + begin + slope * (width * node), magnitude)
             tau += width * weight * _mean(found.sigma_t)
         return tau
 

@@ -78,7 +78,7 @@ class DepthMap(eqx.Module):
     def lit_share(self, x: Triple, softness: int) -> Scalar:
         """Share of the texels around a world position whose light reaches it."""
         texels, depths = self.depths.shape[0], self.depths.reshape(-1)
-        u, v, w = self.space.place(x)
+        u, v, w = self.space.coordinates(x)
         at = [jnp.clip((c + 1) / 2 * (texels - 1), 0, texels - 1) for c in (u, v)]
         low = [jnp.clip(jnp.floor(c), 0, texels - 2) for c in at]
         fraction = [c - b for c, b in zip(at, low, strict=True)]

@@ -80,7 +80,7 @@ class ClearGrid(eqx.Module):
     def transmittance(self, x: Triple, inside: Bool[Array, "points"]) -> Channels:
         """At a batch of world positions, trilinear. (Not optical depth: behind an opaque surface that is so large that between two nodes
         it would be opaque as well.)"""
-        u, v, w = self.space.place(x)
+        u, v, w = self.space.coordinates(x)
         at = tuple(c * n for c, n in zip((w, (u + 1) / 2, (v + 1) / 2), self.grid.cells, strict=True))
         return self.grid.interpolate(at, inside)
 

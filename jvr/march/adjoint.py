@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 from jvr.march.march import Marched, MarchOptions, ReplayRecord, integrate, march
 from jvr.march.medium import Medium, for_derivatives
 from jvr.march.rules import is_zero, wanted_and_fixed, with_zeros
-from jvr.march.segments import ActiveRays, Stretch, active_rays, lit, occupied_count, places, resample
+from jvr.march.segments import ActiveRays, SegmentBatch, active_rays, node_points, occupied_count, resample, with_lighting
 from jvr.march.steps import Rays, Sample, points_at, segment
 from jvr.march.sums import opacity, through, transmittance
 from jvr.march.wavefront import wavefront_while
@@ -87,7 +87,7 @@ class BackwardRays(NamedTuple):
             return j
         rays = self.active.rays
         extent, u = segment(jnp.maximum(self.steps - 1 - j, 0), self.active.segments, rays.length, dt)
-        within = len(medium.shader.places) > 1
+        within = len(medium.shader.quadrature_nodes) > 1
         first = u + extent / 2 if within else u
         return jnp.minimum(j + medium.occupancy.skip(rays, first, dt, backwards=True, within=within), self.steps)
 
@@ -187,15 +187,15 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangent: M
         """The segment as a function of what its derivative is wanted for; the taps stand for the field."""
         transfer, shader, shadows, rays, dt = eqx.combine(small, rest)
         extent, u = segment(k, count, rays.length, dt)
-        sampled = places(medium, rays, active.ray, k, u, extent)
+        sampled = node_points(medium, rays, active.ray, k, u, extent)
         samples = jax.tree.map(jnp.add, resample(medium, sampled, k < count), taps)
-        where = Stretch(rays, active.ray, k, u, extent, k < count)
+        batch = SegmentBatch(rays, active.ray, k, u, extent, k < count)
         # Light moves with the extinction, of which it knows as the shader does.
         moved = medium._replace(transfer=transfer, shader=shader, shadows=shadows)
-        samples = lit(moved, where, samples, reverse=True)
+        samples = with_lighting(moved, batch, samples, reverse=True)
         point = points_at(rays, active.ray, k, u)
-        looks = jax.vmap(shader.look, in_axes=(None, 0, 0, 0))(transfer, samples, point, extent)
-        return (*computed_once(k < count, looks), u), sampled
+        found = jax.vmap(shader.evaluate_segment, in_axes=(None, 0, 0, 0))(transfer, samples, point, extent)
+        return (*computed_once(k < count, found), u), sampled
 
     (emitted, dtau, u), pull, sampled = jax.vjp(local, small, _no_taps(medium, active.rays), has_aux=True)
 
@@ -220,10 +220,10 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangent: M
 
 
 def _no_taps(medium: Medium, rays: Rays) -> tuple[Sample, ...]:
-    """Zero for everything that is resampled at the places of a segment."""
+    """Zero for everything that is resampled at the quadrature nodes of a segment."""
     points = points_at(rays, jnp.zeros_like(rays.length, jnp.int32), jnp.int32(0), rays.length)
     one = jax.eval_shape(lambda: jax.vmap(medium.field.resample)(points))
-    return (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one),) * len(medium.shader.places)
+    return (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one),) * len(medium.shader.quadrature_nodes)
 
 
 def is_there(tree: Any) -> Any:

@@ -52,18 +52,18 @@ class AbstractVisibility(eqx.Module):
 
 
 class AbstractShader(eqx.Module):
-    """What a segment looks like: everything between the scalar and the eye. Its arrays are small."""
+    """What a segment emits and absorbs: everything between the scalar and the eye. Its arrays are small."""
 
     # Where in a segment the field is resampled, from -1/2 at its front to 1/2 at its back.
-    places: ClassVar[tuple[float, ...]] = (0.0,)
+    quadrature_nodes: ClassVar[tuple[float, ...]] = (0.0,)
 
     @abc.abstractmethod
     def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         """Emitted radiance (three components or none) and optical depth (one, three or none) of one segment of length `dt` whose
         properties are constant."""
 
-    def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        """The same for a segment around `point`, from what is known at `places`."""
+    def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        """The same for a segment around `point`, from what is known at `quadrature_nodes`."""
         sample = self.in_world(transfer, samples[0], point)
         return self.segment(self.classify(transfer, sample), sample, point, dt)
 
@@ -81,7 +81,7 @@ class Medium(NamedTuple):
     is not `None`, each sample knows how much light reaches it."""
 
     field: AbstractField
-    transfer: Any  # what `shader.look` reads: an AbstractTransfer, or one made for the shader
+    transfer: Any  # what `shader.evaluate_segment` reads: an AbstractTransfer, or one made for the shader
     shader: AbstractShader
     occupancy: Occupancy | None = None
     shadows: AbstractVisibility | None = None

@@ -45,7 +45,7 @@ class AbstractOracle(eqx.Module):
     brick: ClassVar[int]
 
     @abc.abstractmethod
-    def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:
+    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
         """The distance between samples that each brick asks for by itself, a world length, infinite where any will do."""
 
 
@@ -54,7 +54,7 @@ class Finest(AbstractOracle):
 
     brick: ClassVar[int] = 64
 
-    def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:
+    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
         return jnp.zeros_like(bricks_of(volume.values, self.brick).lower, jnp.result_type(volume.slope))
 
 
@@ -77,8 +77,8 @@ class OpacityChange(_Tolerant):
 
     brick: ClassVar[int] = 1
 
-    def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:
-        change = _spread(look._replace(features=look.features[-1:]), *_bounds(volume, self.brick))
+    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
+        change = _spread(features._replace(rows=features.rows[-1:]), *_bounds(volume, self.brick))
         return jnp.where(change <= self.tolerance, jnp.inf, 0.0)
 
 
@@ -88,8 +88,8 @@ class BrickRange(_Tolerant):
 
     brick: ClassVar[int] = 4
 
-    def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:
-        change = _spread(look, *_bounds(volume, self.brick))
+    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
+        change = _spread(features, *_bounds(volume, self.brick))
         return jnp.min(volume.spacing) * self.brick * _quotient(self.tolerance, change)
 
 
@@ -108,11 +108,11 @@ class LocalError(_Tolerant):
 
     brick: ClassVar[int] = 1
 
-    def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:
+    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
         c1, c2, largest = (bricks_of(c, self.brick).upper for c in _curvatures(volume))
         low, high = _bounds(volume, self.brick)
         # Interpolated values leave the range of the voxels by no more than a second difference.
-        slope = _steepest(look, low - largest, high + largest)
+        slope = _steepest(features, low - largest, high + largest)
         ask = lambda c, scale: _quotient(scale * self.tolerance, slope * c)
         distance = jnp.minimum(ask(c1, 4.0), jnp.sqrt(ask(c2, 8.0)))
         return jnp.where(jnp.isnan(low + high), 0.0, distance)
@@ -123,7 +123,7 @@ def distance_field(
 ) -> DistanceField:
     """What `oracle` says, up to the world length `farthest`; traceable, not differentiable."""
     volume, table, optical, farthest = jax.lax.stop_gradient((volume, table, optical, farthest))
-    wanted = oracle.wanted(volume, look_at(volume, table, optical))
+    wanted = oracle.wanted(volume, features_of(volume, table, optical))
     return DistanceField(envelope(wanted, thickness(volume, oracle.brick), farthest), oracle.brick)
 
 
@@ -161,20 +161,20 @@ def _smallest_of_three(values: Float[Array, "x y z"], axis: int) -> Float[Array,
     return jnp.minimum(values, jnp.minimum(before, after))
 
 
-class Look(NamedTuple):
+class Features(NamedTuple):
     """What one voxel length of the medium adds to a picture, a row for each feature (emission in each channel, then opacity), at the
     entries of a table."""
 
     table: LinearTransfer | LutTransfer
     positions: Float[Array, "n"]
-    features: Float[Array, "features n"]
+    rows: Float[Array, "features n"]
 
 
-def look_at(volume: Volume, table: LinearTransfer | LutTransfer, optical: AbstractOpticalModel) -> Look:
-    """What the medium looks like to an oracle."""
+def features_of(volume: Volume, table: LinearTransfer | LutTransfer, optical: AbstractOpticalModel) -> Features:
+    """The features of the medium that an oracle looks at."""
     classified = jax.vmap(table.evaluate)(table.positions)
     emitted, dtau = optical.segment(classified, jnp.min(volume.spacing))
-    return Look(table, table.positions, jnp.stack([*emitted, *map(one_minus_exp, dtau)]))
+    return Features(table, table.positions, jnp.stack([*emitted, *map(one_minus_exp, dtau)]))
 
 
 def _bounds(volume: Volume, brick: int) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
@@ -184,13 +184,13 @@ def _bounds(volume: Volume, brick: int) -> tuple[Float[Array, "bx by bz"], Float
     return jnp.minimum(*ends), jnp.maximum(*ends)
 
 
-def _spread(look: Look, low: Float[Array, "bx by bz"], high: Float[Array, "bx by bz"]) -> Float[Array, "bx by bz"]:
+def _spread(features: Features, low: Float[Array, "bx by bz"], high: Float[Array, "bx by bz"]) -> Float[Array, "bx by bz"]:
     """The largest range of any feature over the scalars `low` ... `high`; infinite where they are NaN."""
-    coordinate = jax.vmap(look.table.coordinate)
+    coordinate = jax.vmap(features.table.coordinate)
     u, v = coordinate(low.ravel()), coordinate(high.ravel())
     first, last = jnp.ceil(u).astype(jnp.int32), jnp.floor(v).astype(jnp.int32)
     spread = jnp.zeros_like(u)
-    for feature in look.features:
+    for feature in features.rows:
         a, b = _lerp(feature, u), _lerp(feature, v)
         inside, below = _largest(feature, first, last), -_largest(-feature, first, last)
         top = jnp.maximum(jnp.maximum(a, b), jnp.where(last >= first, inside, -jnp.inf))
@@ -199,12 +199,12 @@ def _spread(look: Look, low: Float[Array, "bx by bz"], high: Float[Array, "bx by
     return jnp.where(jnp.isnan(low + high), jnp.inf, spread.reshape(low.shape))
 
 
-def _steepest(look: Look, low: Float[Array, "bx by bz"], high: Float[Array, "bx by bz"]) -> Float[Array, "bx by bz"]:
+def _steepest(features: Features, low: Float[Array, "bx by bz"], high: Float[Array, "bx by bz"]) -> Float[Array, "bx by bz"]:
     """The steepest slope of any feature over the scalars `low` ... `high`."""
-    coordinate = jax.vmap(look.table.coordinate)
+    coordinate = jax.vmap(features.table.coordinate)
     first = jnp.floor(coordinate(low.ravel())).astype(jnp.int32)
     last = jnp.ceil(coordinate(high.ravel())).astype(jnp.int32) - 1
-    slopes = jnp.max(jnp.abs(jnp.diff(look.features, axis=1)), axis=0) / jnp.diff(look.positions)
+    slopes = jnp.max(jnp.abs(jnp.diff(features.rows, axis=1)), axis=0) / jnp.diff(features.positions)
     return jnp.where(last >= first, _largest(slopes, first, last), 0.0).reshape(low.shape)
 
 

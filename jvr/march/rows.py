@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from jvr.march.adjoint import BackwardRays, SuffixRadiance, segment_cotangents, step_back
 from jvr.march.march import Marched, MarchOptions, integrate
 from jvr.march.medium import Medium, for_derivatives
-from jvr.march.segments import Stretch, active_rays, light_at, occupied_count
+from jvr.march.segments import SegmentBatch, active_rays, light_at, occupied_count
 from jvr.march.shaders import where_known
 from jvr.march.steps import Rays, points_at, segment
 from jvr.march.sums import transmittance
@@ -101,11 +101,11 @@ def _row_segment(
     samples = jax.vmap(medium.field.resample)(points)
     samples = jax.vmap(medium.shader.in_world, in_axes=(None, 0, 0))(medium.transfer, samples, points)
     classified = jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, samples)
-    where = Stretch(active.rays, active.ray, k, distance, extent, k < count)
+    batch = SegmentBatch(active.rays, active.ray, k, distance, extent, k < count)
 
     def radiance_and_depth(classified: Classified) -> tuple[Channels, Channels]:
         # Where in the segment the light is looked up depends on its extinction; the light itself does not.
-        light = {} if medium.shadows is None else {"light": light_at(medium, where, classified.sigma_t, reverse=True)}
+        light = {} if medium.shadows is None else {"light": light_at(medium, batch, classified.sigma_t, reverse=True)}
         return jax.vmap(medium.shader.segment)(classified, samples._replace(**light), points, extent)
 
     (emitted, dtau), pull = jax.vjp(radiance_and_depth, classified)

@@ -1,4 +1,4 @@
-"""One segment of every ray: which one comes next, what it looks like, and how much light reaches it."""
+"""One segment of every ray: which one comes next, what it emits and absorbs, and how much light reaches it."""
 
 import functools
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ class ActiveRays(NamedTuple):
     segments: Int[Array, "rays"]
 
 
-class Stretch(NamedTuple):
+class SegmentBatch(NamedTuple):
     """One segment of every ray: its index, the distance of its middle from the entry, its length, and whether it is there."""
 
     rays: Rays
@@ -48,7 +48,7 @@ def skip(medium: Medium, active: ActiveRays, dt: Scalar, k: Int[Array, "rays"]) 
     if medium.occupancy is None:
         return k
     extent, u = segment(k, active.segments, active.rays.length, dt)
-    within = len(medium.shader.places) > 1
+    within = len(medium.shader.quadrature_nodes) > 1
     first = u - extent / 2 if within else u
     return jnp.minimum(k + medium.occupancy.skip(active.rays, first, dt, within=within), active.segments)
 
@@ -76,15 +76,15 @@ def occupied_count(
 def take_segment(medium: Medium, active: ActiveRays, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
     """Emission and optical depth of segment `k` of every ray, and the distance of its midpoint; zero beyond `count`."""
     extent, u = segment(k, count, active.rays.length, dt)
-    sampled = places(medium, active.rays, active.ray, k, u, extent)
-    where = Stretch(active.rays, active.ray, k, u, extent, k < count)
-    samples = lit(medium, where, resample(medium, sampled, k < count), reverse=False)
+    sampled = node_points(medium, active.rays, active.ray, k, u, extent)
+    batch = SegmentBatch(active.rays, active.ray, k, u, extent, k < count)
+    samples = with_lighting(medium, batch, resample(medium, sampled, k < count), reverse=False)
     point = points_at(active.rays, active.ray, k, u)
-    emitted, dtau = jax.vmap(medium.shader.look, in_axes=(None, 0, 0, 0))(medium.transfer, samples, point, extent)
+    emitted, dtau = jax.vmap(medium.shader.evaluate_segment, in_axes=(None, 0, 0, 0))(medium.transfer, samples, point, extent)
     return emitted, dtau, u
 
 
-def places(
+def node_points(
     medium: Medium,
     rays: Rays,
     ray: Int[Array, "rays"],
@@ -93,11 +93,11 @@ def places(
     extent: Float[Array, "rays"],
 ) -> list[Point]:
     """Where a segment around `u` is resampled."""
-    return [points_at(rays, ray, k, u + at * extent if at else u) for at in medium.shader.places]
+    return [points_at(rays, ray, k, u + at * extent if at else u) for at in medium.shader.quadrature_nodes]
 
 
 def resample(medium: Medium, sampled: list[Point], proof: Bool[Array, "rays"]) -> tuple[Sample, ...]:
-    """The field at each of the places, once for all channels of the shader; `proof` as in `computed_once`, and zero where it is false."""
+    """The field at each quadrature node, once for all channels of the shader; `proof` as in `computed_once`, zero where it is false."""
     return tuple(_known(medium, points, proof) for points in sampled)
 
 
@@ -115,11 +115,11 @@ def classify_at(medium: Medium, points: Point, proof: Bool[Array, "points"]) -> 
     return jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, samples), samples
 
 
-def lit(medium: Medium, where: Stretch, samples: tuple[Sample, ...], *, reverse: bool) -> tuple[Sample, ...]:
+def with_lighting(medium: Medium, batch: SegmentBatch, samples: tuple[Sample, ...], *, reverse: bool) -> tuple[Sample, ...]:
     """The samples of a segment with the light that reaches it, where that is asked for."""
     if medium.shadows is None:
         return samples
-    shader, middle = medium.shader, points_at(where.rays, where.ray, where.k, where.u)
+    shader, middle = medium.shader, points_at(batch.rays, batch.ray, batch.k, batch.u)
 
     def classify(sample: Sample, point: Point) -> tuple[Channels, Channels]:
         """Extinction, and on the way back how it changes with the scalar."""
@@ -127,12 +127,12 @@ def lit(medium: Medium, where: Stretch, samples: tuple[Sample, ...], *, reverse:
         return jax.jvp(of, (sample.s,), (jnp.ones_like(sample.s),)) if reverse else (of(sample.s), ())
 
     sigma_t, slopes = zip(*(jax.vmap(classify)(sample, middle) for sample in samples), strict=True)
-    light = light_at(medium, where, sum(sigma_t, ()), reverse=reverse, slopes=sum(slopes, ()))
+    light = light_at(medium, batch, sum(sigma_t, ()), reverse=reverse, slopes=sum(slopes, ()))
     return tuple(sample._replace(light=light) for sample in samples)
 
 
 def light_at(
-    medium: Medium, where: Stretch, sigma_t: Sequence[Array], *, reverse: bool, slopes: Sequence[Array] = ()
+    medium: Medium, batch: SegmentBatch, sigma_t: Sequence[Array], *, reverse: bool, slopes: Sequence[Array] = ()
 ) -> tuple[Channels, ...]:
     """How much light reaches a segment with these extinctions, and these changes of them with the scalar.
 
@@ -140,15 +140,15 @@ def light_at(
     is dark, though its front is not.
     """
     assert medium.shadows is not None
-    dtau = jnp.minimum(sum(sigma_t[1:], sigma_t[0]) / len(sigma_t) * where.extent, DENSEST)
-    u = computed_once(where.inside, where.u + where.extent * (mean_depth(dtau) - 0.5))
-    points = points_at(where.rays, where.ray, where.k, u)
+    dtau = jnp.minimum(sum(sigma_t[1:], sigma_t[0]) / len(sigma_t) * batch.extent, DENSEST)
+    u = computed_once(batch.inside, batch.u + batch.extent * (mean_depth(dtau) - 0.5))
+    points = points_at(batch.rays, batch.ray, batch.k, u)
     # Without extinction there is nothing to see; but where it begins, or nothing is left out, it has a derivative, and between the ends of
     # a segment there may be what is at neither.
-    everywhere = medium.occupancy is None or len(medium.shader.places) > 1
+    everywhere = medium.occupancy is None or len(medium.shader.quadrature_nodes) > 1
     occupied = functools.reduce(jnp.logical_or, [x != 0 for x in (*sigma_t, *slopes)])
-    wanted = where.inside if everywhere else where.inside & occupied
-    return computed_once(where.inside, medium.shadows.transmittances(points, wanted, reverse=reverse))
+    wanted = batch.inside if everywhere else batch.inside & occupied
+    return computed_once(batch.inside, medium.shadows.transmittances(points, wanted, reverse=reverse))
 
 
 def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:

@@ -85,9 +85,9 @@ class LightPathShader(OpticalShader):
 class PreIntegratedShader(OpticalShader):
     """The optical model alone, the scalar linear along a segment."""
 
-    places: ClassVar[tuple[float, ...]] = (-0.5, 0.5)
+    quadrature_nodes: ClassVar[tuple[float, ...]] = (-0.5, 0.5)
 
-    def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+    def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
         emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
         return where_known(samples, emitted), where_known(samples, dtau)

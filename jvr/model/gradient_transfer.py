@@ -53,10 +53,10 @@ class GradientTransfer(AbstractTransfer):
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
         # Whatever the length of the gradient: it depends on voxels farther away, too.
         n = self.rgb.shape[0]
-        lit = jnp.any(~(jnp.abs(self.sigma_t.reshape(n, -1)) <= least), axis=1)
+        visible = jnp.any(~(jnp.abs(self.sigma_t.reshape(n, -1)) <= least), axis=1)
         beyond = high < self.domain[0], low > self.domain[1]
         u, v = (_coordinate(s, self.domain, n) for s in (low, high))
-        return any_between(lit, u, v, beyond if nearby else None)
+        return any_between(visible, u, v, beyond if nearby else None)
 
 
 class GradientOpacity(AbstractTransfer):

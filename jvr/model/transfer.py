@@ -64,9 +64,9 @@ class AbstractTable(AbstractTransfer):
         """Where `s` falls in the table, 0 ... n-1, clamped; entry `i` has weight `max(0, 1 - |coordinate - i|)`."""
 
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
-        lit = jnp.any(~(jnp.abs(self.sigma_t.reshape(self.sigma_t.shape[0], -1)) <= least), axis=1)
+        visible = jnp.any(~(jnp.abs(self.sigma_t.reshape(self.sigma_t.shape[0], -1)) <= least), axis=1)
         beyond = high < self.ends[0], low > self.ends[1]
-        return any_between(lit, self.coordinate(low), self.coordinate(high), beyond if nearby else None)
+        return any_between(visible, self.coordinate(low), self.coordinate(high), beyond if nearby else None)
 
 
 class LinearTransfer(AbstractTable):
@@ -194,20 +194,20 @@ class GaussianTransfer(AbstractTransfer):
 
 
 def any_between(
-    lit: Bool[Array, "n"], u: Scalar, v: Scalar, beyond: tuple[Bool[Array, ""], Bool[Array, ""]] | None
+    visible: Bool[Array, "n"], u: Scalar, v: Scalar, beyond: tuple[Bool[Array, ""], Bool[Array, ""]] | None
 ) -> Bool[Array, ""]:
-    """Whether any entry is `lit` that has a weight in a table's coordinates `u` ... `v`, both clamped to 0 ... n-1.
+    """Whether any entry is `visible` that has a weight in a table's coordinates `u` ... `v`, both clamped to 0 ... n-1.
 
     Where `beyond` says whether what was clamped lies in front of the first entry and behind the last one, also those that have one next
     to `u` and `v`: at an entry both of its neighbours, beyond an end none.
     """
-    n = lit.shape[0]
+    n = visible.shape[0]
     first, last = jnp.floor(u), jnp.ceil(v)
     if beyond is not None:
         first = jnp.where(beyond[1], n - 1, jnp.maximum(jnp.ceil(u) - 1, 0))
         last = jnp.where(beyond[0], 0, jnp.minimum(jnp.floor(v) + 1, n - 1))
     # Entries are counted: a difference of sums of the extinctions themselves would round small ones away.
-    before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(lit, dtype=jnp.int32)])
+    before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(visible, dtype=jnp.int32)])
     return before[last.astype(jnp.int32) + 1] > before[first.astype(jnp.int32)]
 
 
