@@ -62,17 +62,17 @@ class LitShader(OpticalShader):
         # A medium that nothing reflects from glows as it is.
         glows = shading is None and self.natural is None
         factor, added = [zero + 1 if glows else zero] * 3, [zero] * 3
-        arrives = sample.light or ((),) * (len(self.lights) + 1)
-        for light, transmittance in zip(self.lights, arrives, strict=False):
-            towards, _, irradiance = light.arrives(x, w_o)
-            arriving = _times(irradiance, transmittance)
+        transmittances = sample.light or ((),) * (len(self.lights) + 1)
+        for light, transmittance in zip(self.lights, transmittances, strict=False):
+            w_i, _, irradiance = light.sample(x, w_o)
+            incident = _times(irradiance, transmittance)
             if shading is not None:
-                diffuse, specular = shading.reflect(surface, normal, w_o, towards)
-                factor = [f + reflects * diffuse * e for f, e in zip(factor, arriving, strict=True)]
+                diffuse, specular = shading.reflect(surface, normal, w_o, w_i)
+                factor = [f + reflects * diffuse * e for f, e in zip(factor, incident, strict=True)]
                 if specular is not None:
-                    added = [b + reflects * specular * e for b, e in zip(added, arriving, strict=True)]
+                    added = [b + reflects * specular * e for b, e in zip(added, incident, strict=True)]
             if scattering is not None:
-                scattered = _times(arriving, scattering.scatter(w_o, towards))
+                scattered = _times(incident, scattering.scatter(w_o, w_i))
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
         for light in self.ambient:
             if shading is not None:
@@ -81,7 +81,7 @@ class LitShader(OpticalShader):
                 scattered = _times(light.rgb, scattering.scatter_ambient())
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
         if self.natural is not None:
-            around = arrives[len(self.lights)] if len(arrives) > len(self.lights) else ()
+            around = transmittances[len(self.lights)] if len(transmittances) > len(self.lights) else ()
             here = Segment(medium, sample.gradient, dt)
             tinted, plain = self.natural.reflect(sample.s, magnitude, normal, w_o, around, cut, here)
             factor = [f + reflects * c for f, c in zip(factor, tinted, strict=True)]

@@ -94,20 +94,20 @@ class NaturalLight(eqx.Module):
         magnitude: Scalar,
         normal: Triple,
         w_o: Triple,
-        arriving: Channels,
+        incident: Channels,
         cut: Scalar | float = 0.0,
         here: Segment | None = None,
     ) -> tuple[Triple, Triple]:
         """What the colour of the medium is multiplied with, and what is added to that in the light's own colour.
 
-        `arriving`: of the environment, and where surfaces shadow themselves, how much of one there is; `here`: the segment, then.
+        `incident`: of the environment, and where surfaces shadow themselves, how much of one there is; `here`: the segment, then.
         `magnitude`: length of the gradient. Where it is weak, bands of the light above the first count less, but for the share of a point
         that is a `cut`. The normal is turned to the eye.
         """
         zero, surface = jnp.zeros_like(s), share_of(magnitude, self.threshold)
         surface = surface + cut * (1 - surface)
-        arriving, solid = (arriving, zero) if self.shadow is None else (arriving[:-1], arriving[-1])
-        coefficients, share = self._light(arriving, s)
+        incident, solid = (incident, zero) if self.shadow is None else (incident[:-1], incident[-1])
+        coefficients, share = self._light(incident, s)
         turn = jnp.where(dot(normal, w_o) < 0, -1.0, 1.0)
         normal = tuple(turn * c for c in normal)
         cosine = dot(normal, w_o)
@@ -132,12 +132,12 @@ class NaturalLight(eqx.Module):
             parts.append(tuple(larger(r, 0.0) for r in radiance) if self.clamped else radiance)
         return parts[0], parts[1]
 
-    def _light(self, arriving: Channels, s: Scalar) -> tuple[list[Triple], Triple]:
+    def _light(self, incident: Channels, s: Scalar) -> tuple[list[Triple], Triple]:
         """Coefficients of the light at a sample, and what share of it arrives."""
         one = jnp.ones_like(s)
         if self.light is None:
-            return [arriving[i : i + 3] for i in range(0, len(arriving), 3)], (one, one, one)
-        return [(row[0], row[1], row[2]) for row in self.light], arriving * (3 // len(arriving)) if arriving else (one,) * 3
+            return [incident[i : i + 3] for i in range(0, len(incident), 3)], (one, one, one)
+        return [(row[0], row[1], row[2]) for row in self.light], incident * (3 // len(incident)) if incident else (one,) * 3
 
     def _class(self, s: Scalar) -> tuple[Array, Scalar]:
         """The class before a scalar, and the fraction of the way to the next."""

@@ -80,11 +80,11 @@ class RayVisibility(AbstractVisibility):
         volume = field.volume
         x = volume.world_from_point(points.p)
         # No light that casts shadows depends on where the eye is.
-        towards, distance, _ = jax.vmap(lambda x: light.arrives(x, x))(x)
-        along = volume.grid_from_world(towards, direction=True)
+        w_i, distance, _ = jax.vmap(lambda x: light.sample(x, x))(x)
+        along = volume.grid_from_world(w_i, direction=True)
         length = smaller(ray_box(points.p, along, *volume.domain)[1], distance)
         if clipping is not None:
-            length = smaller(length, ray_box(x, towards, tuple(clipping.lower), tuple(clipping.upper))[1])
+            length = smaller(length, ray_box(x, w_i, tuple(clipping.lower), tuple(clipping.upper))[1])
         reaches = wanted & (length > 0)
         keep = lambda v: tuple(jnp.where(reaches, c, 0.0) for c in v)
         return Rays(keep(points.p), keep(along), jnp.where(reaches, length, 0.0))

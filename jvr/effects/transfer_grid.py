@@ -66,14 +66,14 @@ def transfer_visibility(scene: Scene, medium: Medium, inner: AbstractVisibility 
         projected = scattered(scene, projected)
     coefficients, light = projected.coefficients, environment.coefficients
     if transfer.exact:
-        arriving = _products(coefficients, light, material.projected(scene.material_order).order)
+        incident = _products(coefficients, light, material.projected(scene.material_order).order)
     else:
-        arriving = _shares(projected.facing, coefficients, light)
+        incident = _shares(projected.facing, coefficients, light)
     if material.needs_gradient:
-        arriving = jnp.concatenate([arriving, projected.solid[..., None]], axis=-1)
+        incident = jnp.concatenate([incident, projected.solid[..., None]], axis=-1)
     shape = coefficients.shape[:3]
     x, y, z = ((m - 1) / (n - 1) if n > 1 else 0.0 for n, m in zip(scene.volume.shape, shape, strict=True))
-    return TransferVisibility(Grid.of(arriving), (x, y, z), inner, lights)
+    return TransferVisibility(Grid.of(incident), (x, y, z), inner, lights)
 
 
 def transfer_of(scene: Scene) -> RadianceTransfer:
@@ -194,10 +194,10 @@ def _shares(
     shares = []
     for colour in range(3):
         # Numbers of a node far from each other and those of all nodes side by side: one loop for all that follows.
-        arriving = matrix[..., colour] @ flat[colour % channels]
-        own, whole = (sum(y * v[i] for i, y in enumerate(functions)) for v in (arriving, full[:, colour]))
+        incident = matrix[..., colour] @ flat[colour % channels]
+        own, whole = (sum(y * v[i] for i, y in enumerate(functions)) for v in (incident, full[:, colour]))
         # Where a surface faces no light the share is that of all light.
-        own, whole = (jnp.maximum(v, 0.0) + DARK * jnp.maximum(r[0], 0.0) for v, r in ((own, arriving), (whole, full[:, colour])))
+        own, whole = (jnp.maximum(v, 0.0) + DARK * jnp.maximum(r[0], 0.0) for v, r in ((own, incident), (whole, full[:, colour])))
         shares.append(divide_or_zero(own, whole))
     return jnp.stack(shares, axis=-1).reshape(*facing.shape[:3], 3)
 

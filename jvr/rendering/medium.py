@@ -59,7 +59,7 @@ def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool,
 
     kind = LitPreIntegratedShader if pre_integrated else LitShader
     ambient = tuple(light for light in scene.lights if isinstance(light, AmbientLight))
-    lights, volume = arriving_lights(scene), scene.volume
+    lights, volume = delta_lights(scene), scene.volume
     cut = None
     if scene.clipping is not None and frame is not None:
         cut = CutFaces(scene.clipping, jnp.min(volume.spacing))
@@ -89,8 +89,8 @@ def scatters_by_gradient(scene: Scene) -> bool:
     return scene.scattering is not None and scene.scattering.needs_gradient
 
 
-def arriving_lights(scene: Scene) -> tuple[AbstractLight, ...]:
-    """The lights that come from one direction at each point."""
+def delta_lights(scene: Scene) -> tuple[AbstractLight, ...]:
+    """The lights that come from one direction at each point (delta lights)."""
     return tuple(light for light in scene.lights if isinstance(light, AbstractLight))
 
 
@@ -106,13 +106,13 @@ def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility 
     shadows = None
     if scene.shadows is not None:
         medium = absorbing(scene, occupancy, scene.transfer.takes_gradient)
-        shadows = scene.shadows.visibility(scene, arriving_lights(scene), medium, jnp.min(scene.volume.spacing))
+        shadows = scene.shadows.visibility(scene, delta_lights(scene), medium, jnp.min(scene.volume.spacing))
     if scene.radiance_transfer is None:
         return shadows
     from jvr.effects.transfer_grid import transfer_visibility
 
     medium = absorbing(scene, occupancy, scene.transfer.takes_gradient or scene.radiance_transfer.needs_gradient)
-    return transfer_visibility(scene, medium, shadows, len(arriving_lights(scene)))
+    return transfer_visibility(scene, medium, shadows, len(delta_lights(scene)))
 
 
 def absorbing(scene: Scene, occupancy: Occupancy | None, graded: bool) -> Medium:

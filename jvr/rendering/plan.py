@@ -11,7 +11,7 @@ from jvr.model.light import AmbientLight
 from jvr.model.optical import EmissionOnly
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.rendering.medium import arriving_lights, scatters_by_gradient
+from jvr.rendering.medium import delta_lights, scatters_by_gradient
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
 
@@ -112,7 +112,7 @@ def _light_parts(scene: Scene) -> tuple[Part, ...]:
     }
     asking = " and ".join(name for name, there in asks.items() if there)
     gradient = f"{describe(scene.normals)}, asked for by {asking}" if asking else "nothing asks for a gradient"
-    casting = sum(light.casts_shadows for light in arriving_lights(scene))
+    casting = sum(light.casts_shadows for light in delta_lights(scene))
     shaded = none if shadows is None else f"{describe(shadows)} for {casting} light{'s' * (casting != 1)}"
     by_gradient = ("lights", "gradient")
     return (
