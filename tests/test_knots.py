@@ -12,9 +12,9 @@ import pytest
 from scenes import compiled
 
 import jvr
+from jvr.effects.environment_lighting import environment_lighting
 from jvr.effects.grid import Grid
 from jvr.effects.light_space import bilinear
-from jvr.effects.natural_light import natural_light
 from jvr.effects.shading import share_of
 from jvr.numerics import clamp
 
@@ -148,7 +148,9 @@ def test_light_of_zero(x64):
 
     @compiled
     def reflected(light):
-        return natural_light(material, light, clamped=True, order=1, from_samples=False).reflect(s, s, up, tilted, ())[0][0]
+        return environment_lighting(material, light, clamped=True, order=1, from_samples=False).reflect(s, s, up, tilted, ())[0][
+            0
+        ]
 
     zero, tangent = jnp.zeros((4, 3)), jnp.asarray([[1.0], [0.3], [-0.2], [0.1]]) * jnp.ones(3)
     found = jax.jvp(reflected, (zero,), (tangent,))[1]

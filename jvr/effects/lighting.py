@@ -35,7 +35,7 @@ class LitShader(OpticalShader):
     shading: AbstractShading | None
     scattering: AbstractScattering | None
     cut: CutFaces | None = None  # where surfaces are clipped
-    natural: Any = None  # a `jvr.effects.natural_light.NaturalLight`, where there is light from all around
+    environment: Any = None  # a `jvr.effects.environment_lighting.EnvironmentLighting`, where the scene has an environment
 
     def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         factor, added = self.light_at(sample, point, medium, dt)
@@ -53,14 +53,16 @@ class LitShader(OpticalShader):
         cut = zero
         if self.cut is not None:
             # What is hardly a surface has hardly a say in the normal.
-            share = surface if self.natural is None or shading is not None else share_of(magnitude, self.natural.threshold)
+            share = (
+                surface if self.environment is None or shading is not None else share_of(magnitude, self.environment.threshold)
+            )
             normal, cut = self.cut.normal(x, tuple(share * n for n in normal))
             surface = surface + cut * (1 - surface)
         scatters = zero + 1 if scattering is None or not scattering.needs_gradient else scattering.share(magnitude)
         # Where there is a switch, what is not a surface scatters and does not reflect.
         reflects = 1 - scatters if scattering is not None and scattering.needs_gradient else zero + 1
         # A medium that nothing reflects from glows as it is.
-        glows = shading is None and self.natural is None
+        glows = shading is None and self.environment is None
         factor, added = [zero + 1 if glows else zero] * 3, [zero] * 3
         transmittances = sample.light or ((),) * (len(self.lights) + 1)
         for light, transmittance in zip(self.lights, transmittances, strict=False):
@@ -80,10 +82,10 @@ class LitShader(OpticalShader):
             if scattering is not None:
                 scattered = _times(light.rgb, scattering.scatter_ambient())
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
-        if self.natural is not None:
+        if self.environment is not None:
             around = transmittances[len(self.lights)] if len(transmittances) > len(self.lights) else ()
             here = Segment(medium, sample.gradient, dt)
-            tinted, plain = self.natural.reflect(sample.s, magnitude, normal, w_o, around, cut, here)
+            tinted, plain = self.environment.reflect(sample.s, magnitude, normal, w_o, around, cut, here)
             factor = [f + reflects * c for f, c in zip(factor, tinted, strict=True)]
             added = [b + reflects * c for b, c in zip(added, plain, strict=True)]
         return tuple(factor), tuple(added)

@@ -41,7 +41,7 @@ class OwnShadow(eqx.Module):
 
     `width`: how far in front of a sample the medium counts as near where there is nothing but a surface, as far as rays of nodes begin
     above it; `of_opacity`: gradients are those of the extinction; `bleeds`: the medium that is near shows its colour instead of a shadow,
-    with an `albedo` (`jvr.effects.natural_light.NaturalLight`) what that reflects of light from everywhere.
+    with an `albedo` (`jvr.effects.environment_lighting.EnvironmentLighting`) what that reflects of light from everywhere.
     """
 
     transfer: AbstractTransfer

@@ -38,7 +38,7 @@ class MaterialBleeding(eqx.Module):
 
 
 class RadianceTransfer(AbstractRadianceTransfer):
-    """Shadows, colour bleeding and scattering of light that comes from all around (`Scene(environment=...)`).
+    """Shadows, colour bleeding and scattering of environment lighting (`Scene(environment=...)`).
 
     Opacities `o` of a node's width of medium, at a node and one node further in all directions, give a surface where the material has a
     normal: with their change `m` by Sobel's weights it is one by the share `max(o) m^2 / (m^2 + surface^2)`, `solid`. Then rays begin

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jvr.effects.environment_lighting import EnvironmentLighting, albedo_of
 from jvr.effects.grid import Grid
-from jvr.effects.natural_light import NaturalLight, albedo_of
 from jvr.effects.projected_transfer import ProjectedTransfer
 from jvr.effects.radiance_transfer import RadianceTransfer
 from jvr.effects.transfer_nodes import CHUNK, node_positions, project_nodes
@@ -26,7 +26,7 @@ from jvr.model.volume import ClippingBox, Volume
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import Channels
 
-# Weight of the light from all around beside that which a surface faces.
+# Weight of the environment lighting beside that which a surface faces.
 DARK = 0.005
 
 
@@ -97,7 +97,7 @@ class TransferProjection(eqx.Module):
     volume: Volume
     clipping: ClippingBox | None
     medium: Medium
-    albedo: NaturalLight | None
+    albedo: EnvironmentLighting | None
     surfaces: bool = eqx.field(static=True)
 
     @classmethod

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.effects.natural_light import NaturalLight
+from jvr.effects.environment_lighting import EnvironmentLighting
 from jvr.effects.radiance_transfer import RadianceTransfer
 from jvr.effects.shading import share_of
 from jvr.march.medium import Medium
@@ -52,7 +52,7 @@ def project_nodes(
     volume: Volume,
     clipping: ClippingBox | None,
     medium: Medium,
-    albedo: NaturalLight | None,
+    albedo: EnvironmentLighting | None,
     surfaces: bool,
     p: Float[Array, "nodes 3"],
 ) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
@@ -162,7 +162,9 @@ def _rays(volume: Volume, clipping: ClippingBox | None, p: Triple, direction: Tr
     return _Rays(p, direction, along, jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0))
 
 
-def _carried(transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo: NaturalLight | None, rays: _Rays) -> Channels:
+def _carried(
+    transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo: EnvironmentLighting | None, rays: _Rays
+) -> Channels:
     """What rays carry from far away to grid positions: transmittance, or with bleeding white light behind the colours of what they pass."""
     ends = jnp.asarray(transfer.boundaries(volume.shape), rays.t_out.dtype) * 2 * volume.radius
     opaque = -math.log(transfer.termination) if transfer.termination > 0 else math.inf
@@ -199,7 +201,7 @@ def _carried(transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo:
     return tuple(c + T for c, T in zip(colour, clear * (3 // channels), strict=True)) if colour else clear
 
 
-def _colour(rgb: Triple, sample: Any, albedo: NaturalLight | None, w_o: Triple) -> Triple:
+def _colour(rgb: Triple, sample: Any, albedo: EnvironmentLighting | None, w_o: Triple) -> Triple:
     """What a ray picks up of a sample: the colour of the transfer function, or what the material reflects of light from everywhere."""
     if albedo is None:
         return rgb

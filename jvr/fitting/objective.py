@@ -357,7 +357,7 @@ class _Kinds(NamedTuple):
                 inner.append(places)
                 own = taken + np.arange(array.size)
                 taken += array.size
-                # A colour of light from all around is seen in that colour alone: one march for all three.
+                # A colour of environment lighting is seen in that colour alone: one march for all three.
                 apart = name == "scene.environment.coefficients"
                 directions.append(own.reshape(-1, 3) if apart else np.repeat(own[:, None], 3, axis=1))
         return cls(problem, entries, np.concatenate(outer), np.concatenate(inner), np.concatenate(directions))

@@ -21,7 +21,7 @@ from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
 from jvr.numerics import two_sum
 from jvr.pictures import as_radiance
-from jvr.rendering.medium import medium, natural, occupancy, visibility
+from jvr.rendering.medium import environment, medium, occupancy, visibility
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
 from jvr.rendering.trace import Prepared, ahead, enter, near_volume, step_length
@@ -227,7 +227,7 @@ def prepare_in_fit(scene: Scene, settings: Settings, skips: bool, visible: Abstr
     much light reaches a point, where that is known."""
     (scene,) = near_volume(scene)
     occupied = occupancy(scene, settings) if settings.negligible or skips else None
-    return Prepared(occupied, visibility(scene, occupied) if visible is None else visible, natural(scene))
+    return Prepared(occupied, visibility(scene, occupied) if visible is None else visible, environment(scene))
 
 
 def is_mostly_empty(scene: Scene, settings: Settings) -> bool:

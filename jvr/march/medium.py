@@ -35,7 +35,7 @@ class AbstractField(eqx.Module):
 
 
 class AbstractVisibility(eqx.Module):
-    """How much of each light reaches a point, and of that from all around where the scene asks for it."""
+    """How much of each light reaches a point, and of the environment's where the scene asks for it."""
 
     @abc.abstractmethod
     def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:

@@ -75,7 +75,7 @@ class AbstractMaterial(eqx.Module):
 
 
 class AbstractRadianceTransfer(eqx.Module):
-    """How the medium around a point changes the light that reaches it from all around."""
+    """How the medium around a point changes the light of the environment that reaches it."""
 
     # Whether samples bring the light that reaches them, and not a share of all of it.
     exact: eqx.AbstractVar[bool]

@@ -1,4 +1,4 @@
-"""Light from all around: radiance from far away as a function of direction, in spherical harmonics."""
+"""Environment lighting: radiance from far away as a function of direction, in spherical harmonics."""
 
 import math
 import os

@@ -30,7 +30,7 @@ def medium(
     settings: Settings,
     occupancy: Occupancy | None = None,
     shadows: AbstractVisibility | None = None,
-    natural: Any = None,
+    environment: Any = None,
 ) -> Medium:
     """What of a scene rays march through: what the scene does not name is not in it. The last three are those of `Prepared`."""
     frame, normals = _gradients(scene)
@@ -38,7 +38,7 @@ def medium(
     quadrature = settings.quadrature
     pre_integrated = isinstance(quadrature, PreIntegrated)
     if is_lit(scene):
-        shader = _lit_shader(scene, frame, pre_integrated, natural)
+        shader = _lit_shader(scene, frame, pre_integrated, environment)
     else:
         shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
     if not isinstance(quadrature, PreIntegrated):
@@ -53,7 +53,7 @@ def is_lit(scene: Scene) -> bool:
     return scene.shading is not None or scene.scattering is not None or scene.material is not None
 
 
-def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool, natural: Any) -> AbstractShader:
+def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool, environment: Any) -> AbstractShader:
     from jvr.effects.cut import CutFaces
     from jvr.effects.lighting import LitPreIntegratedShader, LitShader
 
@@ -63,7 +63,7 @@ def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool,
     cut = None
     if scene.clipping is not None and frame is not None:
         cut = CutFaces(scene.clipping, jnp.min(volume.spacing))
-    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering, cut, natural)
+    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering, cut, environment)
 
 
 def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
@@ -122,13 +122,13 @@ def absorbing(scene: Scene, occupancy: Occupancy | None, graded: bool) -> Medium
     return Medium(VoxelField(scene.volume, normals), scene.transfer, shader, occupancy)
 
 
-def natural(scene: Scene) -> Any:
-    """The material under light from all around, or `None` without one. Made once for a picture."""
+def environment(scene: Scene) -> Any:
+    """The material under environment lighting, or `None` without one. Made once for a picture."""
     if scene.material is None:
         return None
-    from jvr.effects.natural_light import natural_light_of
+    from jvr.effects.environment_lighting import environment_lighting_of
 
-    return natural_light_of(scene)
+    return environment_lighting_of(scene)
 
 
 def occupancy(scene: Scene, settings: Settings) -> Occupancy | None:

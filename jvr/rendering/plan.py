@@ -131,9 +131,9 @@ def _light_parts(scene: Scene) -> tuple[Part, ...]:
 
 
 def _environment_parts(scene: Scene) -> tuple[Part, ...]:
-    """Light from all around, the material that shows it, and what is in its way."""
+    """Environment lighting, the material that shows it, and what is in its way."""
     environment, material, transfer, none = scene.environment, scene.material, scene.radiance_transfer, "the scene names none"
-    around = none if environment is None else f"light from all around, {len(environment.coefficients)} coefficients"
+    around = none if environment is None else f"environment lighting, {len(environment.coefficients)} coefficients"
     needs = ("environment", "gradient") if material is not None and material.needs_gradient else ("environment",)
     shown = none if material is None else describe(material)
     made = "" if transfer is None else "computed beforehand" if transfer.is_frozen else "computed in each picture: jvr.precompute"

@@ -15,7 +15,7 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, larger, one_minus_exp, ray_box, smaller
-from jvr.rendering.medium import medium, natural, occupancy, visibility
+from jvr.rendering.medium import environment, medium, occupancy, visibility
 from jvr.rendering.settings import Settings
 from jvr.types import Scalar, Triple
 
@@ -24,12 +24,12 @@ FAR = 2.0
 
 
 class Prepared(NamedTuple):
-    """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under light from
-    all around; each `None` where the scene asks for none."""
+    """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under
+    environment lighting; each `None` where the scene asks for none."""
 
     occupancy: Occupancy | None = None
     shadows: AbstractVisibility | None = None
-    natural: Any = None
+    environment: Any = None
 
     @property
     def shadow_stats(self) -> Any:
@@ -40,7 +40,7 @@ def prepare(scene: Scene, settings: Settings) -> Prepared:
     """What rays through a scene need to know beforehand, computed once."""
     (scene,) = near_volume(scene)
     occupied = occupancy(scene, settings)
-    return Prepared(occupied, visibility(scene, occupied), natural(scene))
+    return Prepared(occupied, visibility(scene, occupied), environment(scene))
 
 
 def trace(

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jvr.io.config.cameras import cameras_of
+from jvr.io.config.environment import Precompute, environment_parts, fit_scene, keeps_transfer, precomputed
 from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.light import graded, light_parts
 from jvr.io.config.load import Config, started
-from jvr.io.config.natural import Precompute, fit_scene, keeps_transfer, natural_parts, precomputed
 from jvr.io.config.schema.transfer import AnyTransfer, TransferFile
 from jvr.io.config.schema.whole import AnySampling, FitTable, RefinementTable, SlicesTable, VolumeTable
 from jvr.io.config.transfers import build_transfer, read_transfer, with_gradient
@@ -182,7 +182,7 @@ def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
     if tables.clipping is not None:
         with blame(config.where("clipping"), "clipping"):
             clipping = ClippingBox(tables.clipping.lower, tables.clipping.upper)
-    light = light_parts(config, transfer) | natural_parts(config)
+    light = light_parts(config, transfer) | environment_parts(config)
     fitted = () if tables.fit is None else tables.fit.unknowns
     if not any(name.startswith("volume.") for name in fitted):
         volume = graded(volume, light, transfer)

@@ -1,4 +1,4 @@
-"""Light from all around against brute force: directional lights with shadow rays, which know no harmonics and no nodes."""
+"""Environment lighting against brute force: directional lights with shadow rays, which know no harmonics and no nodes."""
 
 import dataclasses
 import math

@@ -9,7 +9,7 @@ import numpy as np
 from jvr.io.config.errors import blame
 from jvr.io.config.light import phase_of
 from jvr.io.config.load import Config
-from jvr.io.config.schema.natural import (
+from jvr.io.config.schema.environment import (
     AnyEnvironment,
     AnyMaterial,
     DipoleTable,
@@ -27,8 +27,8 @@ from jvr.model.scene import Scene, material_order
 Precompute = Callable[..., Scene]
 
 
-def natural_parts(config: Config) -> dict[str, Any]:
-    """What a configuration says about light from all around, as keywords of `jvr.Scene`."""
+def environment_parts(config: Config) -> dict[str, Any]:
+    """What a configuration says about environment lighting, as keywords of `jvr.Scene`."""
     tables, parts = config.tables, {}
     if tables.radiance_transfer is not None:
         with blame(config.where("radiance_transfer"), "radiance_transfer"):
@@ -45,7 +45,7 @@ def natural_parts(config: Config) -> dict[str, Any]:
 
 
 def precomputed(scene: Scene, **keywords: Any) -> Scene:
-    """`jvr.precompute`, which is imported for scenes alone that have light from all around."""
+    """`jvr.precompute`, which is imported for scenes alone that have environment lighting."""
     if scene.environment is None:
         return scene
     from jvr.io.precompute import precompute

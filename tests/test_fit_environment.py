@@ -1,4 +1,4 @@
-"""Light from all around, materials, dipoles and the transfer function under them are recovered from pictures."""
+"""Environment lighting, materials, dipoles and the transfer function under them are recovered from pictures."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Light from all around, materials under it, and radiance transfer: closed forms, white furnace, independent sums, gradients."""
+"""Environment lighting, materials under it, and radiance transfer: closed forms, white furnace, independent sums, gradients."""
 
 import dataclasses
 import itertools
@@ -14,7 +14,7 @@ from scenes import OBLIQUE, compiled, linear_transfer, perspective, rotation, vo
 
 import jvr
 from jvr.effects.diffusion import kernel_of, scatter
-from jvr.effects.natural_light import natural_light
+from jvr.effects.environment_lighting import environment_lighting
 from jvr.effects.transfer_grid import TransferProjection, project_all
 from jvr.model.harmonics.projection import sphere_nodes
 from jvr.rendering.medium import absorbing
@@ -115,7 +115,7 @@ def test_what_is_reflected_is_the_integral_of_material_and_light(name):
     with jax.enable_x64(True):
         brdf, env = jax.tree.map(lambda x: x.astype(float), (brdf, env))
         material = jvr.HarmonicMaterial.project(brdf, 3, directions=64, nodes=48)
-        natural = natural_light(material, env.coefficients, clamped=False, order=3, from_samples=False)
+        lighting = environment_lighting(material, env.coefficients, clamped=False, order=3, from_samples=False)
         nodes, weights = sphere_nodes(160)
         functions, radiance = np.asarray(jvr.sh.evaluate(3, nodes)), np.asarray(env.coefficients)
         rng = np.random.default_rng(0)
@@ -126,7 +126,7 @@ def test_what_is_reflected_is_the_integral_of_material_and_light(name):
             frame = np.stack([t / np.linalg.norm(t), np.cross(n, t / np.linalg.norm(t)), n])
             own_o, own_i = frame @ w_o, frame @ nodes.T
             parts = brdf.evaluate(tuple(map(jnp.asarray, own_o)), tuple(map(jnp.asarray, own_i)))
-            found = natural.reflect(jnp.asarray(0.5), jnp.asarray(1.0), tuple(jnp.asarray(n)), tuple(jnp.asarray(w_o)), ())
+            found = lighting.reflect(jnp.asarray(0.5), jnp.asarray(1.0), tuple(jnp.asarray(n)), tuple(jnp.asarray(w_o)), ())
             for part, value in zip(parts, found, strict=True):
                 expected = [
                     (functions.T @ (weights * np.asarray(part[c % len(part)]))) @ radiance[:, c] if part else 0.0
@@ -158,7 +158,7 @@ def test_materials_by_value_are_linear_between_their_positions():
     both = jvr.MaterialByValue([0.0, 1.0], kinds).projected(3)
     alone = [kind.projected(3) for kind in kinds]
     n, w_o = (jnp.array(v) / np.linalg.norm(v) for v in ([1.0, 2, 3], [1.0, 0, 2]))
-    at = lambda m, s: natural_light(m, light().coefficients, clamped=True, order=3, from_samples=False).reflect(
+    at = lambda m, s: environment_lighting(m, light().coefficients, clamped=True, order=3, from_samples=False).reflect(
         jnp.asarray(s), jnp.asarray(1.0), tuple(n), tuple(w_o), ()
     )[0]
     values = [np.array(at(m, 0.0)) for m in alone]

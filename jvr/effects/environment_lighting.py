@@ -1,4 +1,4 @@
-"""What a sample sends to the eye of light that comes from all around: the integral of material and light, both in spherical harmonics.
+"""Environment lighting of a sample: the integral of material times incident light, both in spherical harmonics.
 
 A material is even about the plane of normal `n` and eye. In this plane a band of the light with `2 l + 1` coefficients is known by its
 values in `l + 1` directions, and those are all that is needed of it:
@@ -71,8 +71,8 @@ def _between(low: Array, share: Scalar) -> list[tuple[Any, Any]]:
     return [(low, 1 - share), (low + 1, share)]
 
 
-class NaturalLight(eqx.Module):
-    """A material under light from all around. `light`: its coefficients, of which a sample may bring the share that arrives, one or for
+class EnvironmentLighting(eqx.Module):
+    """A material under environment lighting. `light`: its coefficients, of which a sample may bring the share that arrives, one or for
     each colour; or `None` where each sample brings the coefficients of what arrives, all colours of the first, then of the next."""
 
     light: Float[Array, "bands 3"] | None
@@ -148,7 +148,7 @@ class NaturalLight(eqx.Module):
         return low.astype(jnp.int32), place - low
 
 
-def natural_light(
+def environment_lighting(
     material: HarmonicMaterial,
     light: Float[Array, "bands 3"],
     *,
@@ -156,10 +156,10 @@ def natural_light(
     order: int,
     from_samples: bool,
     shadow: OwnShadow | None = None,
-) -> NaturalLight:
-    """`NaturalLight` up to an order; `from_samples`: each sample brings the coefficients of its light."""
+) -> EnvironmentLighting:
+    """`EnvironmentLighting` up to an order; `from_samples`: each sample brings the coefficients of its light."""
     tinted, plain = (None if lobe is None else PlaneTable.of(lobe, order) for lobe in (material.tinted, material.plain))
-    return NaturalLight(
+    return EnvironmentLighting(
         None if from_samples else light[: count(order)], tinted, plain, material.positions, material.threshold, clamped, shadow
     )
 
@@ -195,7 +195,7 @@ def _in_plane(order: int) -> np.ndarray:
     return result
 
 
-def natural_light_of(scene: Scene) -> NaturalLight:
+def environment_lighting_of(scene: Scene) -> EnvironmentLighting:
     """A scene's material under its environment. Where samples bring the coefficients of what arrives, those of a product, the order is
     that of the material, else also that of the light."""
     environment = scene.environment
@@ -205,15 +205,15 @@ def natural_light_of(scene: Scene) -> NaturalLight:
     exact = scene.radiance_transfer is not None and scene.radiance_transfer.exact
     order = material.order if exact else min(material.order, environment.order)
     shadow = own_shadow_of(scene, albedo_of(scene))
-    return natural_light(
+    return environment_lighting(
         material, environment.coefficients, clamped=environment.clamped, order=order, from_samples=exact, shadow=shadow
     )
 
 
-def albedo_of(scene: Scene) -> NaturalLight | None:
+def albedo_of(scene: Scene) -> EnvironmentLighting | None:
     """A scene's material under light of one from everywhere, where rays of its radiance transfer pick up what it reflects."""
     if scene.radiance_transfer is None or not scene.radiance_transfer.needs_gradient:
         return None
     assert scene.material is not None
     everywhere = jnp.full((1, 3), math.sqrt(4 * math.pi), scene.volume.slope.dtype)
-    return natural_light(scene.material.projected(0), everywhere, clamped=True, order=0, from_samples=False)
+    return environment_lighting(scene.material.projected(0), everywhere, clamped=True, order=0, from_samples=False)
