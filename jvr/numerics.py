@@ -185,13 +185,13 @@ def ray_box(origin: Triple, direction: Triple, lower: Corner, upper: Corner) -> 
     return t_near, t_far
 
 
-def computed_once(proof: Bool[Array, "..."], x: Tree) -> Tree:
-    """`x` itself, which the CPU compiler then computes once and not again in each kernel that reads it.
+def materialise(mask: Bool[Array, "..."], x: Tree) -> Tree:
+    """A fusion barrier: `x` itself, which the CPU compiler then computes once and not again in each kernel that reads it.
 
-    A conditional is the one thing that it does not fuse through (an optimization barrier does not survive it). `proof` has
+    A conditional is the one thing that it does not fuse through (an optimization barrier does not survive it). `mask` has
     an element that is true whenever `x` matters, which the compiler cannot know; where none is, zeros are returned.
     """
-    return jax.lax.cond(jnp.any(proof), lambda x: x, lambda x: jax.tree.map(jnp.zeros_like, x), x)
+    return jax.lax.cond(jnp.any(mask), lambda x: x, lambda x: jax.tree.map(jnp.zeros_like, x), x)
 
 
 def read_at(array: Shaped[Array, "n"], index: Int[Array, "..."]) -> Shaped[Array, "..."]:

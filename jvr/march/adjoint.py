@@ -29,7 +29,7 @@ from jvr.march.segments import ActiveRays, SegmentBatch, active_rays, node_point
 from jvr.march.steps import Rays, Sample, points_at, segment
 from jvr.march.sums import opacity, through, transmittance
 from jvr.march.wavefront import wavefront_while
-from jvr.numerics import computed_once, one_minus_exp, two_sum
+from jvr.numerics import materialise, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
 
@@ -195,7 +195,7 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangent: M
         samples = with_lighting(moved, batch, samples, reverse=True)
         point = points_at(rays, active.ray, k, u)
         found = jax.vmap(shader.evaluate_segment, in_axes=(None, 0, 0, 0))(transfer, samples, point, extent)
-        return (*computed_once(k < count, found), u), sampled
+        return (*materialise(k < count, found), u), sampled
 
     (emitted, dtau, u), pull, sampled = jax.vjp(local, small, _no_taps(medium, active.rays), has_aux=True)
 
@@ -210,7 +210,7 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangent: M
         jnp.add, (total.medium.transfer, total.medium.shader, total.medium.shadows, state.gradient, total.dt), small_gradient
     )
     # Else the whole computation of the cotangent is repeated in each of the scattered additions, which then take three times as long.
-    cotangents = computed_once(on, cotangents)
+    cotangents = materialise(on, cotangents)
     field = total.medium.field
     for points, of_sample in zip(sampled, cotangents, strict=True):
         field = medium.field.deposit(field, points, of_sample)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from jvr.march.steps import Rays
 from jvr.model.bricks import Bricks
 from jvr.model.transfer import AbstractTransfer
-from jvr.numerics import computed_once, read_at
+from jvr.numerics import materialise, read_at
 from jvr.types import Scalar
 
 # Radii of the empty cubes that are told apart, in bricks. Each is the last one plus at most itself plus one (see `_empty_radii`).
@@ -111,13 +111,13 @@ def _empty_radii(*empty: Bool[Array, "bx by bz"]) -> list[UInt8[Array, "bx by bz
     # A bit for each of the arrays, so that all of them take one walk through memory.
     bits = sum((e.astype(jnp.uint8) << i for i, e in enumerate(empty)), jnp.uint8(0))
     # Else each of the two bricks that an erosion looks at is classified anew; where none is empty, zeros say the same.
-    bits = computed_once(bits > 0, bits)
+    bits = materialise(bits > 0, bits)
     of = lambda i: (bits >> i & 1) > 0
     radii = [of(i).astype(jnp.uint8) for i in range(len(empty))]
     for radius, larger in itertools.pairwise(RADII):
         for axis in range(3):
             bits = _erode(bits, axis, larger - radius)
-        bits = computed_once(bits > 0, bits)
+        bits = materialise(bits > 0, bits)
         radii = [jnp.where(of(i), jnp.uint8(larger + 1), r) for i, r in enumerate(radii)]
     return radii
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jvr.march.medium import DENSEST, Medium
 from jvr.march.steps import Point, Rays, Sample, points_at, segment, segment_count
 from jvr.model.transfer import Classified
-from jvr.numerics import computed_once, mean_depth
+from jvr.numerics import materialise, mean_depth
 from jvr.types import Channels, Scalar
 
 # Skips before a ray is started.
@@ -96,21 +96,21 @@ def node_points(
     return [points_at(rays, ray, k, u + at * extent if at else u) for at in medium.shader.quadrature_nodes]
 
 
-def resample(medium: Medium, sampled: list[Point], proof: Bool[Array, "rays"]) -> tuple[Sample, ...]:
-    """The field at each quadrature node, once for all channels of the shader; `proof` as in `computed_once`, zero where it is false."""
-    return tuple(_known(medium, points, proof) for points in sampled)
+def resample(medium: Medium, sampled: list[Point], mask: Bool[Array, "rays"]) -> tuple[Sample, ...]:
+    """The field at each quadrature node, once for all channels of the shader; `mask` as in `materialise`, zero where it is false."""
+    return tuple(_known(medium, points, mask) for points in sampled)
 
 
-def _known(medium: Medium, points: Point, proof: Bool[Array, "rays"]) -> Sample:
+def _known(medium: Medium, points: Point, mask: Bool[Array, "rays"]) -> Sample:
     """The field at a batch of points. A ray that has no segment there reads some voxel all the same, which may be NaN: what it reads is
     zero, in value and in derivative."""
-    sample = computed_once(proof, jax.vmap(medium.field.resample)(points))
-    return jax.tree.map(lambda x: jnp.where(proof.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0), sample)
+    sample = materialise(mask, jax.vmap(medium.field.resample)(points))
+    return jax.tree.map(lambda x: jnp.where(mask.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0), sample)
 
 
-def classify_at(medium: Medium, points: Point, proof: Bool[Array, "points"]) -> tuple[Classified, Sample]:
-    """Colour and extinction at a batch of points, and what the shader knows of them; `proof` as in `computed_once`."""
-    samples = _known(medium, points, proof)
+def classify_at(medium: Medium, points: Point, mask: Bool[Array, "points"]) -> tuple[Classified, Sample]:
+    """Colour and extinction at a batch of points, and what the shader knows of them; `mask` as in `materialise`."""
+    samples = _known(medium, points, mask)
     samples = jax.vmap(medium.shader.in_world, in_axes=(None, 0, 0))(medium.transfer, samples, points)
     return jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, samples), samples
 
@@ -141,14 +141,14 @@ def light_at(
     """
     assert medium.shadows is not None
     dtau = jnp.minimum(sum(sigma_t[1:], sigma_t[0]) / len(sigma_t) * batch.extent, DENSEST)
-    u = computed_once(batch.inside, batch.u + batch.extent * (mean_depth(dtau) - 0.5))
+    u = materialise(batch.inside, batch.u + batch.extent * (mean_depth(dtau) - 0.5))
     points = points_at(batch.rays, batch.ray, batch.k, u)
     # Without extinction there is nothing to see; but where it begins, or nothing is left out, it has a derivative, and between the ends of
     # a segment there may be what is at neither.
     everywhere = medium.occupancy is None or len(medium.shader.quadrature_nodes) > 1
     occupied = functools.reduce(jnp.logical_or, [x != 0 for x in (*sigma_t, *slopes)])
     wanted = batch.inside if everywhere else batch.inside & occupied
-    return computed_once(batch.inside, medium.shadows.transmittances(points, wanted, reverse=reverse))
+    return materialise(batch.inside, medium.shadows.transmittances(points, wanted, reverse=reverse))
 
 
 def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:

@@ -75,7 +75,7 @@ def camera_rays(
     return CameraRays(medium(scene, settings, *prepared), rays, step_length(scene, settings)), t_in
 
 
-def one_precision(scene: Scene, *others: Any) -> Any:
+def promote_dtypes(scene: Scene, *others: Any) -> Any:
     """A scene and whatever else with every floating-point array in the widest precision among them, as the state of the loop needs; with
     x64 on, parts of a scene may differ. Voxels stay as they are in memory."""
     voxels = lambda tree: tree[0].volume.values
@@ -88,7 +88,7 @@ def one_precision(scene: Scene, *others: Any) -> Any:
 def near_volume(scene: Scene, *others: Any) -> Any:
     """A scene and cameras in one precision and in a world whose origin is voxel (0, 0, 0), wherever that lies in theirs: differences of
     positions are taken before they are rounded. Derivatives are those in the world of the scene."""
-    scene, *cameras = one_precision(scene, *others)
+    scene, *cameras = promote_dtypes(scene, *others)
     origin = jax.lax.stop_gradient(scene.volume.origin)
     placed = lambda s: (s.volume, s.clipping, s.lights)
     lights = tuple(light.moved(origin) if isinstance(light, AbstractLight) else light for light in scene.lights)
