@@ -16,7 +16,7 @@ from jvr.fitting import checkpoint
 from jvr.fitting.identifiability import determination
 from jvr.fitting.objective import Problem, normal_equations, value
 from jvr.fitting.observations import keep_samples, observe
-from jvr.fitting.unknowns import Exposed, choose_unknowns
+from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 
 SETTINGS = jvr.Settings(step=0.7, termination=0.0)
 ENTRIES = 8
@@ -99,14 +99,14 @@ def test_kept_samples_change_nothing_and_report_their_bytes():
 def test_kept_samples_are_the_samples():
     problem, observations = _problem(), observe(START, CAMERAS, IMAGES, None, SETTINGS).dealt(720)
     samples, kept = keep_samples(START, observations, SETTINGS, 720, 2**30, clamped=True)
-    values = problem.unknowns.values_from_real(problem.unknowns.real_from_model(problem.model), problem.model)
+    values = problem.unknowns.values_from_unconstrained(problem.unknowns.unconstrained_from_model(problem.model), problem.model)
     direct = normal_equations(problem, values, observations)
     stored = normal_equations(problem.with_samples(samples), values, kept)
     np.testing.assert_allclose(stored.matrix, direct.matrix, rtol=1e-3, atol=1e-4 * np.abs(direct.matrix).max())
 
 
 def _problem(loss=None, exposure=None, unknowns=both) -> Problem:
-    model = Exposed(TRUTH, exposure)
+    model = ExposedModel(TRUTH, exposure)
     chosen = choose_unknowns(model, lambda m: (unknowns(m.scene), m.exposure))
     return Problem(model, chosen, SETTINGS, loss or jvr.SquaredError(), (), None)
 
@@ -124,13 +124,13 @@ def test_normal_equations_have_the_gradient_of_the_objective(loss, names, x64):
     if names == "coloured":
         coloured = scene.transfer.sigma_t[:, None] * jnp.array([1.0, 0.7, 1.3])
         scene = eqx.tree_at(lambda s: s.transfer.sigma_t, scene, coloured)
-    model = Exposed(scene, jnp.ones(()) * 1.1 if names == "everything" else None)
+    model = ExposedModel(scene, jnp.ones(()) * 1.1 if names == "everything" else None)
     pick = lambda s: (*both(s), s.background, s.transfer.domain) if names == "everything" else both(s)
     unknowns = choose_unknowns(model, lambda m: (pick(m.scene), m.exposure))
-    unknowns = eqx.tree_at(lambda u: u.transforms, unknowns, (jvr.Identity(),) * len(unknowns.transforms))
+    unknowns = eqx.tree_at(lambda u: u.bijectors, unknowns, (jvr.Identity(),) * len(unknowns.bijectors))
     problem = Problem(model, unknowns, SETTINGS, loss, (), None)
     observations = observe(scene, CAMERAS, [0.8 * image for image in IMAGES], None, SETTINGS).dealt(720)
-    values = unknowns.real_from_model(model)
+    values = unknowns.unconstrained_from_model(model)
     normal = normal_equations(problem, values, observations)
     pieces = jax.tree.map(lambda x: x[None], observations)
     objective, gradient = jax.value_and_grad(lambda v: value(problem, v, pieces, jnp.ones(())))(values)
@@ -180,7 +180,7 @@ def test_unknowns_are_told_apart_by_their_place():
     scene = eqx.tree_at(lambda s: (s.transfer.rgb, s.transfer.sigma_t), TRUTH, (table, table))
     assert scene.transfer.rgb is scene.transfer.sigma_t
     pick = lambda s: {"sigma_t": s.transfer.sigma_t, "more": (s.transfer.domain, s.transfer.rgb)}
-    chosen = choose_unknowns(Exposed(scene, None), lambda m: pick(m.scene))
+    chosen = choose_unknowns(ExposedModel(scene, None), lambda m: pick(m.scene))
     # Dictionaries are flattened in the order of their keys.
     assert chosen.names == ("scene.transfer.domain", "scene.transfer.rgb", "scene.transfer.sigma_t")
     assert len(set(chosen.places)) == 3

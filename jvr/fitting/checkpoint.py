@@ -34,7 +34,7 @@ def fingerprint(problem: Problem, observations: Observations, solver: Any) -> Fi
         "images": observations.target,
         "weights": observations.weight,
         "unknowns": problem.unknowns.names,
-        "transforms": problem.unknowns.transforms,
+        "transforms": problem.unknowns.bijectors,
         "exposure": problem.model.exposure,
         "settings": problem.settings,
         "loss": problem.loss,

@@ -114,7 +114,7 @@ class AlongDogleg(AbstractDescent):
 class ChunkedState(NamedTuple):
     """`done`: 0 going on, 1 converged, 2 no finite value, 3 stalled."""
 
-    real: np.ndarray
+    unconstrained: np.ndarray
     loss: np.ndarray
     normal: Normal
     step_size: np.ndarray
@@ -151,15 +151,15 @@ class ChunkedLeastSquares(AbstractSolver):
     def bounds(self) -> Interval:
         return ANY
 
-    def init(self, functions: Functions, real: Float[Array, "n"]) -> ChunkedState:
-        loss, normal = functions.levels[0](real)
+    def init(self, functions: Functions, unconstrained: Float[Array, "n"]) -> ChunkedState:
+        loss, normal = functions.levels[0](unconstrained)
         done = 0 if np.isfinite(loss) else _NON_FINITE
-        return _state(np.asarray(real), loss, normal, self.first_step_size, 0, 0, done)
+        return _state(np.asarray(unconstrained), loss, normal, self.first_step_size, 0, 0, done)
 
     def step(self, functions: Functions, state: ChunkedState) -> ChunkedState:
         model, scale = _model(functions, state)
         move = self.descent.move(model, float(state.step_size))
-        trial = _within(functions, state.real, scale * move)
+        trial = _within(functions, state.unconstrained, scale * move)
         loss, normal = functions.levels[int(state.level)](jnp.asarray(trial))
         finite = np.isfinite(loss) and all(np.all(np.isfinite(x)) for x in normal)
         with jax.enable_x64(True):
@@ -193,34 +193,34 @@ class ChunkedLeastSquares(AbstractSolver):
         level = int(state.level) + 1
         if level == len(functions.levels):
             return state._replace(done=np.asarray(done))
-        loss, normal = functions.levels[level](jnp.asarray(state.real))
+        loss, normal = functions.levels[level](jnp.asarray(state.unconstrained))
         step_size = max(float(state.step_size), self.first_step_size)
-        return _state(state.real, loss, normal, step_size, level, 0, 0)
+        return _state(state.unconstrained, loss, normal, step_size, level, 0, 0)
 
     def iterate(self, state: ChunkedState) -> tuple[np.ndarray, float]:
-        return state.real, float(state.loss)
+        return state.unconstrained, float(state.loss)
 
     def outcome(self, state: ChunkedState) -> Outcome | None:
         return (None, Outcome.CONVERGED, Outcome.NON_FINITE, Outcome.STALLED)[int(state.done)]
 
 
 def _model(functions: Functions, state: ChunkedState) -> tuple[Model, Float[np.ndarray, "n"]]:
-    """The model about a state, and what a scaled unknown is in units of the real line."""
-    gradient, matrix = functions.quadratic(state.real, state.normal)
+    """The model about a state, and what a scaled unknown is in units of an unconstrained number."""
+    gradient, matrix = functions.quadratic(state.unconstrained, state.normal)
     diagonal = np.diag(matrix)
     scale = 1 / np.sqrt(np.maximum(diagonal, FLOOR * diagonal.max(initial=TINY)))
-    limits = functions.limits(state.real)
-    lower = np.maximum(limits.lower - state.real, -limits.trust_radius) / scale
-    upper = np.minimum(limits.upper - state.real, limits.trust_radius) / scale
+    limits = functions.limits(state.unconstrained)
+    lower = np.maximum(limits.lower - state.unconstrained, -limits.trust_radius) / scale
+    upper = np.minimum(limits.upper - state.unconstrained, limits.trust_radius) / scale
     scaled = scale[:, None] * matrix * scale + RIDGE * np.eye(len(scale))
     # A start at its bound may be rounded to the other side of it.
     return Model(float(state.loss), scale * gradient, scaled, np.minimum(lower, 0.0), np.maximum(upper, 0.0)), scale
 
 
-def _within(functions: Functions, real: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """The point that a step leads to, in the precision of `real`: rounding does not take it out of its bounds."""
-    limits = functions.limits(real)
-    return np.clip(real + move, limits.lower, limits.upper).astype(real.dtype)
+def _within(functions: Functions, unconstrained: np.ndarray, move: np.ndarray) -> np.ndarray:
+    """The point that a step leads to, in the precision of `unconstrained`: rounding does not take it out of its bounds."""
+    limits = functions.limits(unconstrained)
+    return np.clip(unconstrained + move, limits.lower, limits.upper).astype(unconstrained.dtype)
 
 
 def _state(*fields: Any) -> ChunkedState:

@@ -16,7 +16,7 @@ from jvr.execution.devices import everywhere, over_rays, shares
 from jvr.execution.tiles import dealt_blocks, picture_of, pixels_of
 from jvr.fitting.losses import AbstractPrior, SquaredError
 from jvr.fitting.observations import Observations, Samples, observed_medium, prepare_in_fit
-from jvr.fitting.unknowns import Exposed, Unknowns
+from jvr.fitting.unknowns import ExposedModel, Unknowns
 from jvr.march.differentiation import AbstractAdjoint, Forward, Replay, Rows
 from jvr.march.march import Marched, MarchOptions
 from jvr.march.medium import Medium
@@ -34,7 +34,7 @@ from jvr.types import Image, Scalar, Triple
 class Problem(eqx.Module):
     """A fit without its observations: what is unknown, how it is rendered, what is made small."""
 
-    model: Exposed
+    model: ExposedModel
     unknowns: Unknowns
     settings: Settings
     loss: Any  # AbstractLoss, or DSSIM for solvers that use gradients alone
@@ -88,20 +88,20 @@ class Normal(NamedTuple):
 Blocks = list[tuple[Float[Array, "rays columns"], np.ndarray]]
 
 
-def predict(problem: Problem, model: Exposed, gathered: Marched, length: Float[Array, "rays"]) -> Triple:
+def predict(problem: Problem, model: ExposedModel, gathered: Marched, length: Float[Array, "rays"]) -> Triple:
     """Colours as the target images have them."""
     rgb, _ = composite(model.scene, gathered, length)
     return rgb if model.exposure is None else tuple(model.exposure * c for c in rgb)
 
 
 @eqx.filter_jit
-def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Scalar:
-    """Mean loss over all pixels plus priors, as a function of the unknowns on the real line. `pieces` has a leading axis of chunks."""
-    model = problem.unknowns.model_from_real(problem.model, real)
+def value(problem: Problem, unconstrained: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Scalar:
+    """Mean loss over all pixels plus priors, in unconstrained space. `pieces` has a leading axis of chunks."""
+    model = problem.unknowns.model_from_unconstrained(problem.model, unconstrained)
     prepared = prepare_in_fit(model.scene, problem.settings, problem.skips)
     shared, stored = problem.apart()
 
-    def share(shared: tuple[Problem, Exposed, Prepared], rays: tuple[Array | None, Observations]) -> Array:
+    def share(shared: tuple[Problem, ExposedModel, Prepared], rays: tuple[Array | None, Observations]) -> Array:
         problem, model, prepared = shared
         stored, pieces = rays
 
@@ -109,20 +109,20 @@ def value(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations
             r = residual(problem.whole(stored), model, piece, prepared)
             return sum_ + sum(jnp.sum(piece.weight * problem.loss.value(c)) for c in r), None
 
-        return jax.lax.scan(add_piece, jnp.zeros((), real.dtype), pieces)[0][None]
+        return jax.lax.scan(add_piece, jnp.zeros((), unconstrained.dtype), pieces)[0][None]
 
     loss = jnp.sum(over_rays(share, (shared, model, prepared), (stored, pieces)))
     return loss / total + prior(problem, model)
 
 
 @eqx.filter_jit
-def residuals(problem: Problem, real: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Array:
+def residuals(problem: Problem, unconstrained: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Array:
     """The whole residual vector, scaled to a squared length of the mean squared error; priors have no residuals."""
-    model = problem.unknowns.model_from_real(problem.model, real)
+    model = problem.unknowns.model_from_unconstrained(problem.model, unconstrained)
     adjoint, prepared = adjoint_of(problem), prepare_in_fit(model.scene, problem.settings, problem.skips)
     shared, stored = problem.apart()
 
-    def share(shared: tuple[Problem, Exposed, Prepared, Scalar], rays: tuple[Array | None, Observations]) -> Array:
+    def share(shared: tuple[Problem, ExposedModel, Prepared, Scalar], rays: tuple[Array | None, Observations]) -> Array:
         problem, model, prepared, total = shared
         stored, pieces = rays
 
@@ -136,7 +136,7 @@ def residuals(problem: Problem, real: Float[Array, "unknowns"], pieces: Observat
 
 
 def residual(
-    problem: Problem, model: Exposed, piece: Observations, prepared: Prepared, adjoint: AbstractAdjoint = Replay()
+    problem: Problem, model: ExposedModel, piece: Observations, prepared: Prepared, adjoint: AbstractAdjoint = Replay()
 ) -> Triple:
     """Rendered minus target in each channel, differentiable in the mode of `adjoint`."""
     medium, rays = observed_medium(model.scene, piece, problem.samples, problem.settings, prepared)
@@ -148,10 +148,10 @@ def residual(
 
 @eqx.filter_jit
 def image_value(
-    problem: Problem, real: Float[Array, "unknowns"], cameras: Sequence[AbstractCamera], images: Sequence[Array]
+    problem: Problem, unconstrained: Float[Array, "unknowns"], cameras: Sequence[AbstractCamera], images: Sequence[Array]
 ) -> Scalar:
     """`value` for a loss over whole images: the mean over images plus priors."""
-    model = problem.unknowns.model_from_real(problem.model, real)
+    model = problem.unknowns.model_from_unconstrained(problem.model, unconstrained)
     settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
     losses, prepared = [], prepare_in_fit(model.scene, settings, problem.skips)
     for camera, target in zip(cameras, images, strict=True):
@@ -160,11 +160,13 @@ def image_value(
     return jnp.mean(jnp.stack(losses)) + prior(problem, model)
 
 
-def _rendered(problem: Problem, model: Exposed, camera: AbstractCamera, settings: Settings, prepared: Prepared) -> Image:
+def _rendered(problem: Problem, model: ExposedModel, camera: AbstractCamera, settings: Settings, prepared: Prepared) -> Image:
     """A whole image, colours as the targets have them."""
     height, width = camera.height, camera.width
 
-    def share(shared: tuple[Problem, Exposed, AbstractCamera, Prepared], blocks: Int[Array, "blocks"]) -> Float[Array, "rays 3"]:
+    def share(
+        shared: tuple[Problem, ExposedModel, AbstractCamera, Prepared], blocks: Int[Array, "blocks"]
+    ) -> Float[Array, "rays 3"]:
         problem, model, camera, prepared = shared
         gathered, rays, _ = trace(model.scene, camera, settings, pixels_of(blocks, height, width), prepared=prepared)
         return jnp.stack(predict(problem, model, gathered, rays.length), axis=-1)
@@ -174,7 +176,7 @@ def _rendered(problem: Problem, model: Exposed, camera: AbstractCamera, settings
     return picture_of(rays, height, width, shares())
 
 
-def prior(problem: Problem, model: Exposed) -> Scalar | float:
+def prior(problem: Problem, model: ExposedModel) -> Scalar | float:
     """The sum of all priors."""
     return sum((p.value(model.scene) for p in problem.priors), 0.0)
 
@@ -368,7 +370,7 @@ class _Kinds(NamedTuple):
         np.put_along_axis(vectors, self.directions, 1.0, axis=1)
         return jnp.asarray(vectors, dtype)
 
-    def changed(self, part: Array, values: Float[Array, "unknowns"], places: np.ndarray | None = None) -> Exposed:
+    def changed(self, part: Array, values: Float[Array, "unknowns"], places: np.ndarray | None = None) -> ExposedModel:
         """The model of `values` with `part` in some places, by default those of `inner`. Arrays that hold none of them do not depend on
         `part`."""
         unknowns, model = self.problem.unknowns, self.problem.model
@@ -390,7 +392,7 @@ def has_rows(scene: Scene) -> bool:
 
 def _add_entries(
     problem: Problem,
-    model: Exposed,
+    model: ExposedModel,
     gathered: Marched,
     rows: TableRows,
     length: Float[Array, "rays"],

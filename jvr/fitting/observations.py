@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jvr.execution.devices import everywhere, on_devices, over_rays, shares
-from jvr.march.fields import MISSING, KeptField, VoxelField
+from jvr.march.fields import MISSING, CachedSamples, VoxelField
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
 from jvr.march.steps import Rays, points_at, segment, segment_count
@@ -58,15 +58,15 @@ class Observations(eqx.Module):
         filled = eqx.tree_at(lambda o: o.weight, filled, filled.weight.at[self.size :].set(0))
         return jax.tree.map(lambda x: x[order.reshape(-1, shares()).T.ravel()], filled)
 
-    def thinned(self, every: int, chunk: int) -> "Observations":
+    def subsampled(self, every: int, chunk: int) -> "Observations":
         """Every `every`-th ray of each share, filled up to whole chunks."""
         each = self.size // shares()
         index = np.arange(0, each, every)
         kept = len(index)
         index = np.pad(index, (0, -kept % chunk))
-        thin = jax.tree.map(lambda x: x.reshape(shares(), each, *x.shape[1:])[:, index], self)
-        thin = eqx.tree_at(lambda o: o.weight, thin, thin.weight.at[:, kept:].set(0))
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), thin)
+        subsample = jax.tree.map(lambda x: x.reshape(shares(), each, *x.shape[1:])[:, index], self)
+        subsample = eqx.tree_at(lambda o: o.weight, subsample, subsample.weight.at[:, kept:].set(0))
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), subsample)
 
     def pieces(self, chunk: int) -> list["Observations"]:
         """One chunk of every share at a time."""
@@ -85,9 +85,9 @@ class Samples(eqx.Module):
     stride: int = eqx.field(static=True)
     gaps: bool = eqx.field(static=True)
 
-    def along(self, start: Int[Array, "rays"]) -> KeptField:
+    def along(self, start: Int[Array, "rays"]) -> CachedSamples:
         """The samples of rays as a field."""
-        return KeptField(self.stored, start, self.low, self.scale, self.stride, self.gaps)
+        return CachedSamples(self.stored, start, self.low, self.scale, self.stride, self.gaps)
 
     @property
     def bytes(self) -> int:
