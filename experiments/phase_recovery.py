@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jvr
 from experiments.accuracy_vs_time import machine
-from jvr.fitting.identifiability import determination
+from jvr.fitting.identifiability import identifiability
 from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns
 from jvr.io.config import Config, build_fit, build_scene, read_config
 
@@ -126,7 +126,7 @@ def under_moving_light(config: Config, steps: int = 30) -> tuple[Found, View]:
     values = [np.asarray(chosen.values_from_unconstrained(unconstrained, start)) for unconstrained in path]
     jacobian = np.asarray(_jacobian(residuals, jnp.asarray(values[-1])), np.float64)
     r = np.asarray(residuals_at(residuals, jnp.asarray(values[-1])), np.float64)
-    known = determination(jacobian.T @ jacobian, float(r @ r), r.size)
+    known = identifiability(jacobian.T @ jacobian, float(r @ r), r.size)
     seconds = time.perf_counter() - began
     return Found(_labels(chosen, start), np.stack(values), known.standard_errors, len(path) - 1, seconds, known.rank), views
 

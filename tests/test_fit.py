@@ -13,7 +13,7 @@ from scenes import perspective
 
 import jvr
 from jvr.fitting import checkpoint
-from jvr.fitting.identifiability import determination
+from jvr.fitting.identifiability import identifiability
 from jvr.fitting.objective import Problem, normal_equations, value
 from jvr.fitting.observations import keep_samples, observe
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns
@@ -249,12 +249,12 @@ def test_standard_errors_cover_the_truth():
 def test_determination_of_a_known_matrix():
     rows = np.random.default_rng(0).normal(size=(500, 4))
     rows[:, 3] = rows[:, 0] + rows[:, 1]
-    known = determination(rows.T @ rows, squares=5.0, measurements=500)
+    known = identifiability(rows.T @ rows, squares=5.0, measurements=500)
     assert known.rank == 3
     assert np.all(np.isinf(known.standard_errors[[0, 1, 3]]))
     alone = np.sqrt(5.0 / 497 * np.linalg.pinv(rows.T @ rows)[2, 2])
     assert known.standard_errors[2] == pytest.approx(alone, rel=1e-6)
-    assert known.worst[2] == pytest.approx(0, abs=1e-6)
+    assert known.least_determined[2] == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("angle", "determined"), [(1.0, True), (3e-2, True), (1e-3, True), (1e-6, False)])
@@ -264,7 +264,7 @@ def test_nearly_parallel_columns_are_told_apart_down_to_the_rounding_of_float32(
     columns[:, 4] = np.cos(angle) * columns[:, 3] + np.sin(angle) * columns[:, 4]
     columns[:, 0] *= 1e-3
     rounded = columns.astype(np.float32).astype(np.float64)
-    known = determination(rounded.T @ rounded, squares=3.0, measurements=3000)
+    known = identifiability(rounded.T @ rounded, squares=3.0, measurements=3000)
     exact = np.sqrt(3.0 / (3000 - known.rank) * np.diag(np.linalg.inv(columns.T @ columns)))
     assert known.rank == (5 if determined else 4)
     # Rounding turns a column by 3e-8, which is 3e-5 of the smallest angle that is determined.

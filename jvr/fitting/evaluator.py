@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.execution.devices import on_devices
-from jvr.fitting.identifiability import Determination, determination
+from jvr.fitting.identifiability import Identifiability, identifiability
 from jvr.fitting.losses import DSSIM, SquaredError
 from jvr.fitting.objective import (
     Normal,
@@ -115,7 +115,7 @@ class Evaluator:
         mean = float(jnp.sum(weight[:, None] * jnp.square(targets))) / self.total
         return (ROUNDING * float(jnp.finfo(targets.dtype).eps)) ** 2 * mean
 
-    def determination(self, values: Float[Array, "unknowns"]) -> Determination:
+    def identifiability(self, values: Float[Array, "unknowns"]) -> Identifiability:
         """Standard errors at the solution, over all rays."""
         problem = self.problem
         if isinstance(problem.loss, DSSIM):
@@ -124,7 +124,7 @@ class Evaluator:
         normal = self._sum(values, self.levels[-1], problem)
         matrix = normal.matrix + self._gauge(values, np.diag(normal.matrix))
         measurements = 3 * int(jnp.sum(self.levels[-1].weight > 0))
-        return determination(matrix, float(normal.squares), measurements, float(jnp.finfo(values.dtype).eps))
+        return identifiability(matrix, float(normal.squares), measurements, float(jnp.finfo(values.dtype).eps))
 
     def _gauge(self, values: Float[Array, "unknowns"], diagonal: np.ndarray) -> np.ndarray:
         """What fixes the length of directions: it is 1 by convention, and no image says anything about it."""

@@ -17,7 +17,7 @@ import optimistix as optx
 from jvr.execution.devices import shares
 from jvr.fitting import checkpoint as checkpoints
 from jvr.fitting.evaluator import Evaluator
-from jvr.fitting.identifiability import Determination, undetermined
+from jvr.fitting.identifiability import Identifiability, undetermined
 from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.minimisers import OptimistixSolver
@@ -59,7 +59,7 @@ class FitStats(NamedTuple):
 
     - `seconds`; `kept_bytes`: of samples kept along the rays, 0 where they were resampled.
     - `residual_variance`, `rank`, `condition`: of the Gauss-Newton matrix at the end, see `jvr.fitting.identifiability`.
-    - `worst`: the worst-determined combination of unknowns, as (name, coefficient), largest first.
+    - `worst`: the least-determined direction of the unknowns, as (name, coefficient), largest first.
     - `held_out`: (PSNR, SSIM) of each held-out view, radiance 0 ... 1.
     """
 
@@ -197,7 +197,7 @@ def fit(
     unconstrained, _ = solver.iterate(state)
     values = chosen.values_from_unconstrained(jnp.asarray(unconstrained), model)
     found = chosen.insert(model, chosen.split(values, model))
-    known = evaluator.determination(values) if march_unknowns(problem) <= MOST_FORWARD else undetermined(values.size)
+    known = evaluator.identifiability(values) if march_unknowns(problem) <= MOST_FORWARD else undetermined(values.size)
     errors = chosen.split(jnp.asarray(known.standard_errors), model)
     selected, structure = jax.tree.flatten(unknowns(scene))
     stats = FitStats(
@@ -206,7 +206,7 @@ def fit(
         residual_variance=known.variance,
         rank=known.rank,
         condition=known.condition,
-        worst=_worst(chosen, model, known),
+        worst=_least_determined(chosen, model, known),
         held_out=() if held_out is None else _compare(found, settings, *held_out),
     )
     return FitResult(
@@ -283,13 +283,15 @@ def _iteration(evaluator: Evaluator, solver: AbstractSolver, state: Any, step: i
     return Iteration(step, loss, psnr, seconds, evaluator.levels[level].size / evaluator.rays)
 
 
-def _worst(chosen: Unknowns, model: ExposedModel, known: Determination, most: int = 6) -> tuple[tuple[str, float], ...]:
-    """The largest coefficients of the worst-determined combination, with the names of their unknowns."""
+def _least_determined(
+    chosen: Unknowns, model: ExposedModel, known: Identifiability, most: int = 6
+) -> tuple[tuple[str, float], ...]:
+    """The largest coefficients of the least-determined direction, with the names of their unknowns."""
     labels = []
     for name, array in zip(chosen.names, chosen.values(model), strict=True):
         labels += [f"{name.removeprefix('scene.')}[{', '.join(map(str, i))}]" for i in np.ndindex(array.shape)]
-    order = np.argsort(-np.abs(known.worst))[:most]
-    return tuple((labels[i], float(known.worst[i])) for i in order)
+    order = np.argsort(-np.abs(known.least_determined))[:most]
+    return tuple((labels[i], float(known.least_determined[i])) for i in order)
 
 
 def _compare(
