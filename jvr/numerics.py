@@ -63,7 +63,7 @@ def _one_minus_exp_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[A
 
 
 def mean_depth(tau: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Where the emission that leaves a homogeneous segment of optical depth `tau` comes from on average, as a share of its length:
+    """Where the emission that leaves a homogeneous segment of optical depth `tau` comes from on average, as a fraction of its length:
     `1 / tau - 1 / (exp(tau) - 1)`, from 1/2 for a thin segment towards 0 for an opaque one.
 
     For thin ones by its series, `1/2 - tau/12 + tau^3/720 - tau^5/30240`, whose terms do not cancel; behind large ones `exp` overflows.

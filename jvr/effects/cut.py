@@ -22,15 +22,15 @@ class CutFaces(eqx.Module):
     layer: Scalar
 
     def normal(self, x: Triple, normal: Triple) -> tuple[Triple, Scalar]:
-        """The unit normal of a point in the world, and the share of it that is a cut. `normal`: that of its gradient, as long as the share
-        of the point that is a surface.
+        """The unit normal of a point in the world, and the fraction of it that is a cut. `normal`: that of its gradient, as long as the
+        fraction of the point that is a surface.
         Differentiable; detached: which of two opposite faces is nearer."""
-        outward, share = [], jnp.zeros_like(x[0])
+        outward, fraction = [], jnp.zeros_like(x[0])
         for c, low, high in zip(x, self.box.lower, self.box.upper, strict=True):
             from_low = c - low < high - c
             near = jnp.clip(2 - jnp.where(from_low, c - low, high - c) / self.layer, 0.0, 1.0)
             weight = near * near * (3 - 2 * near)
             outward.append(jnp.where(from_low, -weight, weight))
-            share = jnp.maximum(share, weight)
-        mixed, _ = direction_and_length(tuple(o + (1 - share) * n for o, n in zip(outward, normal, strict=True)))
-        return mixed, share
+            fraction = jnp.maximum(fraction, weight)
+        mixed, _ = direction_and_length(tuple(o + (1 - fraction) * n for o, n in zip(outward, normal, strict=True)))
+        return mixed, fraction

@@ -24,7 +24,7 @@ class DeepShadowMap(AbstractShadows):
 
     A piece goes on as long as the straight line from its start through the transmittance at its end stays within `error` of all that it
     passes. Where `layers` pieces do not suffice, the last one goes straight to the end of the ray, with an error that nothing bounds:
-    `rendering.stats.shadows` says what share of the rays that were, and the largest error of any.
+    `rendering.stats.shadows` says what fraction of the rays that were, and the largest error of any.
 
     **Arguments:** `texels`: rays along each axis of the map; `layers`: pieces of each, at least 1; `error`: of transmittance, above 0.
 
@@ -62,7 +62,7 @@ class DeepShadowMap(AbstractShadows):
 
 
 class ShadowStats(NamedTuple):
-    """How well the pieces of a deep shadow map follow the transmittance: the share of rays that ran out of pieces, and the largest error
+    """How well the pieces of a deep shadow map follow the transmittance: the fraction of rays that ran out of pieces, and the largest error
     along any ray."""
 
     overflow: Scalar
@@ -111,8 +111,8 @@ def _along(z: Float[Array, "nodes"], T: Float[Array, "nodes"], w: Scalar) -> Sca
     value = T[0]
     for k in range(z.shape[0] - 1):
         length = z[k + 1] - z[k]
-        share = jnp.clip((w - z[k]) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
-        value += jnp.where(length > 0, share, 0.0) * (T[k + 1] - T[k])
+        fraction = jnp.clip((w - z[k]) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
+        value += jnp.where(length > 0, fraction, 0.0) * (T[k + 1] - T[k])
     return value
 
 

@@ -28,8 +28,8 @@ def scatter(
     over the nodes `x_i` of the medium (`there`) in a neighbourhood, with the dipole's diffuse reflectance `R_d` and its total `R`.
     The paper's equation (4) divides by the number of neighbours instead, which leaves the scale of the picture to the units of `R_d`.
 
-    **Arguments:** `radius`: of the neighbourhood, as a share of the volume's longest side, and at most that share of the longest axis in
-    voxels along each (they may differ where voxels are longer than wide). By FFT, so that the time hardly depends on it.
+    **Arguments:** `radius`: of the neighbourhood, as a fraction of the volume's longest side, and at most that fraction of the longest axis
+    in voxels along each (they may differ where voxels are longer than wide). By FFT, so that the time hardly depends on it.
     Differentiable in everything.
     """
     kernel = kernel_of(dipole, radius, volume, there.shape)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.effects.own_shadow import OwnShadow, Segment, own_shadow_of
-from jvr.effects.shading import share_of
+from jvr.effects.shading import surface_weight
 from jvr.model.harmonics.basis import band_of, basis, count
 from jvr.model.material import About, HarmonicMaterial, Lobe
 from jvr.model.scene import Scene
@@ -66,13 +66,13 @@ class PlaneTable(eqx.Module):
         return jnp.asarray(row).reshape(self.shape)
 
 
-def _between(low: Array, share: Scalar) -> list[tuple[Any, Any]]:
+def _between(low: Array, fraction: Scalar) -> list[tuple[Any, Any]]:
     """An entry and the next, with their weights."""
-    return [(low, 1 - share), (low + 1, share)]
+    return [(low, 1 - fraction), (low + 1, fraction)]
 
 
 class EnvironmentLighting(eqx.Module):
-    """A material under environment lighting. `light`: its coefficients, of which a sample may bring the share that arrives, one or for
+    """A material under environment lighting. `light`: its coefficients, of which a sample may bring the fraction that arrives, one or for
     each colour; or `None` where each sample brings the coefficients of what arrives, all colours of the first, then of the next."""
 
     light: Float[Array, "bands 3"] | None
@@ -101,13 +101,13 @@ class EnvironmentLighting(eqx.Module):
         """What the colour of the medium is multiplied with, and what is added to that in the light's own colour.
 
         `incident`: of the environment, and where surfaces shadow themselves, how much of one there is; `here`: the segment, then.
-        `magnitude`: length of the gradient. Where it is weak, bands of the light above the first count less, but for the share of a point
-        that is a `cut`. The normal is turned to the eye.
+        `magnitude`: length of the gradient. Where it is weak, bands of the light above the first count less, but for the fraction of a
+        point that is a `cut`. The normal is turned to the eye.
         """
-        zero, surface = jnp.zeros_like(s), share_of(magnitude, self.threshold)
+        zero, surface = jnp.zeros_like(s), surface_weight(magnitude, self.threshold)
         surface = surface + cut * (1 - surface)
         incident, solid = (incident, zero) if self.shadow is None else (incident[:-1], incident[-1])
-        coefficients, share = self._light(incident, s)
+        coefficients, fraction = self._light(incident, s)
         turn = jnp.where(dot(normal, w_o) < 0, -1.0, 1.0)
         normal = tuple(turn * c for c in normal)
         cosine = dot(normal, w_o)
@@ -128,12 +128,12 @@ class EnvironmentLighting(eqx.Module):
             counts = zero + 1 if table.about == "eye" else surface
             scales = [kept[0], *(tuple(counts * k for k in band) for band in kept[1:])]
             radiance = _integrate(table.at(place, theta), coefficients, table.directions(normal, across, w_o), scales)
-            radiance = tuple(c * r for c, r in zip(share, radiance, strict=True))
+            radiance = tuple(c * r for c, r in zip(fraction, radiance, strict=True))
             parts.append(tuple(larger(r, 0.0) for r in radiance) if self.clamped else radiance)
         return parts[0], parts[1]
 
     def _light(self, incident: Channels, s: Scalar) -> tuple[list[Triple], Triple]:
-        """Coefficients of the light at a sample, and what share of it arrives."""
+        """Coefficients of the light at a sample, and what fraction of it arrives."""
         one = jnp.ones_like(s)
         if self.light is None:
             return [incident[i : i + 3] for i in range(0, len(incident), 3)], (one, one, one)

@@ -24,7 +24,7 @@ from jvr.model.volume import Volume
 from jvr.numerics import clamp, direction_and_length, dot, larger, ray_box, rounded_into, smaller
 from jvr.types import Channels, Scalar, Triple, Vector
 
-# A light nearer to the bounding sphere of the volume than this share of its radius shines in all directions.
+# A light nearer to the bounding sphere of the volume than this fraction of its radius shines in all directions.
 NEAR = 1.01
 # Samples of a sweep that are taken at a time: enough to outweigh what it costs to start an operation and to share it between cores.
 SWEPT = 65536

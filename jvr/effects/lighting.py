@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from jvr.effects.cut import CutFaces
 from jvr.effects.own_shadow import Segment
-from jvr.effects.shading import share_of
+from jvr.effects.shading import surface_weight
 from jvr.march.shaders import OpticalShader, PreIntegratedShader, where_known
 from jvr.march.steps import Point, Sample
 from jvr.model.by_value import at_value
@@ -49,16 +49,18 @@ class LitShader(OpticalShader):
         w_o, _ = direction_and_length(turned(-self.world_from_grid[:3, :3], point.direction))
         shading, scattering = at_value((self.shading, self.scattering), sample.s)
         normal, magnitude = direction_and_length(tuple(-g for g in sample.gradient)) if sample.gradient else ((zero,) * 3, zero)
-        surface = zero if shading is None else shading.surface_share(magnitude)
+        surface = zero if shading is None else shading.surface_weight(magnitude)
         cut = zero
         if self.cut is not None:
             # What is hardly a surface has hardly a say in the normal.
-            share = (
-                surface if self.environment is None or shading is not None else share_of(magnitude, self.environment.threshold)
+            weight = (
+                surface
+                if self.environment is None or shading is not None
+                else surface_weight(magnitude, self.environment.threshold)
             )
-            normal, cut = self.cut.normal(x, tuple(share * n for n in normal))
+            normal, cut = self.cut.normal(x, tuple(weight * n for n in normal))
             surface = surface + cut * (1 - surface)
-        scatters = zero + 1 if scattering is None or not scattering.needs_gradient else scattering.share(magnitude)
+        scatters = zero + 1 if scattering is None or not scattering.needs_gradient else scattering.medium_weight(magnitude)
         # Where there is a switch, what is not a surface scatters and does not reflect.
         reflects = 1 - scatters if scattering is not None and scattering.needs_gradient else zero + 1
         # A medium that nothing reflects from glows as it is.
@@ -78,7 +80,7 @@ class LitShader(OpticalShader):
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
         for light in self.ambient:
             if shading is not None:
-                factor = [f + reflects * shading.ambient_share() * e for f, e in zip(factor, light.rgb, strict=True)]
+                factor = [f + reflects * shading.ambient_reflectance() * e for f, e in zip(factor, light.rgb, strict=True)]
             if scattering is not None:
                 scattered = _times(light.rgb, scattering.scatter_ambient())
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]

@@ -41,7 +41,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
     """Shadows, colour bleeding and scattering of environment lighting (`Scene(environment=...)`).
 
     Opacities `o` of a node's width of medium, at a node and one node further in all directions, give a surface where the material has a
-    normal: with their change `m` by Sobel's weights it is one by the share `max(o) m^2 / (m^2 + surface^2)`, `solid`. Then rays begin
+    normal: with their change `m` by Sobel's weights it is one by the weight `max(o) m^2 / (m^2 + surface^2)`, `solid`. Then rays begin
     above it, `1.75 solid` nodes along the normal, so that nodes below and above a surface know the same light; what the medium up to
     there takes is found at each sample (`jvr.effects.own_shadow`). They are sent into the part of the sphere that is not below it: with
     `alpha = pi / 2 (1 - solid)`, directions within `pi / 2 + alpha` of the normal are drawn with density `1 / (2 pi (1 + sin alpha))`,
@@ -55,8 +55,8 @@ class RadianceTransfer(AbstractRadianceTransfer):
     - `bleeding`: `None` (rays carry visibility), `TransferBleeding()` or `MaterialBleeding()` (front-to-back colour, and what remains of
       white light behind it).
     - `scattering`: `jvr.Dipole(...)` or `None`: each node gets the mean of what its neighbours receive, weighted with the dipole's diffuse
-      reflectance; `neighbourhood`: its radius, as a share of the volume's longest side.
-    - `exact`: the triple product of material, light and transfer at each sample. Without it, nodes know which share of the light arrives
+      reflectance; `neighbourhood`: its radius, as a fraction of the volume's longest side.
+    - `exact`: the triple product of material, light and transfer at each sample. Without it, nodes know which fraction of the light arrives
       of all that a matte surface reflects that faces where the medium there does (with a material without normal: of all light), and the
       sample multiplies that with its own product of material and light. Both are the same where nothing else is in the way.
     - `chromaticity`: `None`, or the order to keep colour differences at, where rays carry colour; luminance keeps `order`.
@@ -224,7 +224,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
         return content((parts, self.scattering if is_scattered else None))
 
     def boundaries(self, shape: tuple[int, int, int]) -> np.ndarray:
-        """Ends of the steps of a ray, as shares of the volume's diameter."""
+        """Ends of the steps of a ray, as fractions of the volume's diameter."""
         across = max(math.sqrt(sum((n - 1) ** 2 for n in shape)), 1.0)
         ends = [0.0]
         while ends[-1] < across:

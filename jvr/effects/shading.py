@@ -30,7 +30,7 @@ class Lambert(AbstractShading):
 
     - `ambient`, `diffuse`: numbers, not negative, or `jvr.ByValue` for a material by scalar.
     - `threshold`: length of the gradient (data units per world length) of half a surface: a point with a gradient of length `m` is one
-      by the share `m^2 / (m^2 + threshold^2)`; the rest of it reflects as if it faced the light, so that homogeneous regions are not
+      by the weight `m^2 / (m^2 + threshold^2)`; the rest of it reflects as if it faced the light, so that homogeneous regions are not
       shaded as surfaces. 0: whatever has a gradient is a surface.
     - `two_sided`: the normal is turned to the eye; else the side of larger values is dark.
 
@@ -50,24 +50,24 @@ class Lambert(AbstractShading):
         threshold: ArrayLike = 0.0,
         two_sided: bool = True,
     ):
-        self.ambient = _share(ambient, "ambient")
-        self.diffuse = _share(diffuse, "diffuse")
+        self.ambient = _fraction(ambient, "ambient")
+        self.diffuse = _fraction(diffuse, "diffuse")
         self.threshold = float_array(threshold, "threshold", ())
         require(self.threshold, NOT_NEGATIVE.holds, "threshold must be a length of the gradient, not negative")
         self.two_sided = two_sided
 
-    def ambient_share(self) -> Scalar:
+    def ambient_reflectance(self) -> Scalar:
         return self.ambient
 
-    def surface_share(self, magnitude: Scalar) -> Scalar:
-        return share_of(magnitude, self.threshold)
+    def surface_weight(self, magnitude: Scalar) -> Scalar:
+        return surface_weight(magnitude, self.threshold)
 
-    def reflect(self, share: Scalar, normal: Triple, w_o: Triple, w_i: Triple) -> tuple[Scalar, Scalar | None]:
+    def reflect(self, weight: Scalar, normal: Triple, w_o: Triple, w_i: Triple) -> tuple[Scalar, Scalar | None]:
         normal = self._turned(normal, w_o)
         facing = jnp.maximum(dot(normal, w_i), 0.0)
-        diffuse = self.diffuse * (1 + share * (facing - 1))
+        diffuse = self.diffuse * (1 + weight * (facing - 1))
         gloss = self.gloss(normal, w_o, w_i)
-        return diffuse, None if gloss is None else share * jnp.where(facing > 0, gloss, 0.0)
+        return diffuse, None if gloss is None else weight * jnp.where(facing > 0, gloss, 0.0)
 
     def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         """What is reflected in the colour of the light."""
@@ -100,7 +100,7 @@ class Phong(Lambert):
         two_sided: bool = True,
     ):
         super().__init__(ambient, diffuse, threshold=threshold, two_sided=two_sided)
-        self.specular = _share(specular, "specular")
+        self.specular = _fraction(specular, "specular")
         self.shininess = coefficient(shininess, "shininess", EXPONENT.holds, "shininess must be an exponent of at least 1")
 
     def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
@@ -130,14 +130,14 @@ class BlinnPhong(Phong):
         return jnp.where(length > 0, self.specular * power_of_cosine(normal, half, self.shininess), 0.0)
 
 
-def share_of(magnitude: Float[Array, "..."], threshold: Scalar) -> Float[Array, "..."]:
+def surface_weight(magnitude: Float[Array, "..."], threshold: Scalar) -> Float[Array, "..."]:
     """`m^2 / (m^2 + t^2)`, by the ratio of the smaller to the larger, so that no square overflows; 0 where `m` is 0."""
     # Where both are the same, one has the derivative of the magnitude and the other that of the threshold.
     ratio = jnp.square(divide_or_zero(smaller(threshold, magnitude), larger(magnitude, threshold)))
-    share = jnp.where(magnitude >= threshold, 1 / (1 + ratio), ratio / (1 + ratio))
+    weight = jnp.where(magnitude >= threshold, 1 / (1 + ratio), ratio / (1 + ratio))
     # A gradient that vanishes has no normal, whatever the threshold.
-    return jnp.where(magnitude > 0, share, jax.lax.stop_gradient(jnp.zeros_like(magnitude)))
+    return jnp.where(magnitude > 0, weight, jax.lax.stop_gradient(jnp.zeros_like(magnitude)))
 
 
-def _share(value: ArrayLike | ByValue, name: str) -> Any:
+def _fraction(value: ArrayLike | ByValue, name: str) -> Any:
     return coefficient(value, name, NOT_NEGATIVE.holds, f"{name} must be finite and not negative")

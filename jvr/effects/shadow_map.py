@@ -75,8 +75,8 @@ class DepthMap(eqx.Module):
     space: AbstractLightSpace
     depths: Float[Array, "u v"]
 
-    def lit_share(self, x: Triple, softness: int) -> Scalar:
-        """Share of the texels around a world position whose light reaches it."""
+    def lit_fraction(self, x: Triple, softness: int) -> Scalar:
+        """Fraction of the texels around a world position whose light reaches it."""
         texels, depths = self.depths.shape[0], self.depths.reshape(-1)
         u, v, w = self.space.coordinates(x)
         at = [jnp.clip((c + 1) / 2 * (texels - 1), 0, texels - 1) for c in (u, v)]
@@ -102,8 +102,8 @@ class MapVisibility(AbstractVisibility):
 
     def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
         x = jax.lax.stop_gradient(transformed(self.world_from_grid, points.p))
-        share = lambda depths: jax.vmap(lambda x: depths.lit_share(x, self.softness))(x)
-        return tuple(() if depths is None else (share(depths),) for depths in self.maps)
+        fraction = lambda depths: jax.vmap(lambda x: depths.lit_fraction(x, self.softness))(x)
+        return tuple(() if depths is None else (fraction(depths),) for depths in self.maps)
 
     @property
     def stats(self) -> None:

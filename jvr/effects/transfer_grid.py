@@ -31,8 +31,8 @@ DARK = 0.005
 
 
 class TransferVisibility(AbstractVisibility):
-    """What `inner` says of the scene's lights and, as one more light, of the environment: its share that arrives in each colour, or the
-    coefficients of what arrives, all colours of the first, then of the next."""
+    """What `inner` says of the scene's lights and, as one more light, of the environment: the fraction of it that arrives in each colour,
+    or the coefficients of what arrives, all colours of the first, then of the next."""
 
     grid: Grid
     scale: tuple[float, float, float] = eqx.field(static=True)
@@ -68,7 +68,7 @@ def transfer_visibility(scene: Scene, medium: Medium, inner: AbstractVisibility 
     if transfer.exact:
         incident = _products(coefficients, light, material.projected(scene.material_order).order)
     else:
-        incident = _shares(projected.facing, coefficients, light)
+        incident = _fractions(projected.facing, coefficients, light)
     if material.needs_gradient:
         incident = jnp.concatenate([incident, projected.solid[..., None]], axis=-1)
     shape = coefficients.shape[:3]
@@ -178,10 +178,10 @@ def scattered(scene: Scene, projected: ProjectedTransfer) -> ProjectedTransfer:
     return dataclasses.replace(projected, luminance=coefficients, chroma=None, scattered=True)
 
 
-def _shares(
+def _fractions(
     facing: Float[Array, "x y z 3"], coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "others 3"]
 ) -> Float[Array, "x y z 3"]:
-    """The share of each colour of the light that arrives, of all that a matte surface would reflect that faces where the node does; 0
+    """The fraction of each colour of the light that arrives, of all that a matte surface would reflect that faces where the node does; 0
     where there is no light."""
     matrix = product_matrix(light, math.isqrt(coefficients.shape[-1]) - 1, 2)
     channels = coefficients.shape[3]
@@ -191,15 +191,15 @@ def _shares(
     kernel = [1.0, *(length * k for k in (2 / 3, 1 / 4))]
     functions = [y * kernel[band] for y, band in zip(basis(2, normal), band_of(2), strict=True)]
     full = jnp.pad(light, ((0, max(9 - light.shape[0], 0)), (0, 0)))[:9]
-    shares = []
+    fractions = []
     for colour in range(3):
         # Numbers of a node far from each other and those of all nodes side by side: one loop for all that follows.
         incident = matrix[..., colour] @ flat[colour % channels]
         own, whole = (sum(y * v[i] for i, y in enumerate(functions)) for v in (incident, full[:, colour]))
-        # Where a surface faces no light the share is that of all light.
+        # Where a surface faces no light the fraction is that of all light.
         own, whole = (jnp.maximum(v, 0.0) + DARK * jnp.maximum(r[0], 0.0) for v, r in ((own, incident), (whole, full[:, colour])))
-        shares.append(divide_or_zero(own, whole))
-    return jnp.stack(shares, axis=-1).reshape(*facing.shape[:3], 3)
+        fractions.append(divide_or_zero(own, whole))
+    return jnp.stack(fractions, axis=-1).reshape(*facing.shape[:3], 3)
 
 
 def _products(

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jvr.effects.environment_lighting import EnvironmentLighting
 from jvr.effects.radiance_transfer import RadianceTransfer
-from jvr.effects.shading import share_of
+from jvr.effects.shading import surface_weight
 from jvr.march.medium import Medium
 from jvr.march.segments import classify_at
 from jvr.march.steps import Point
@@ -26,9 +26,9 @@ Numbers: TypeAlias = Float[Array, "..."]
 
 # Nodes that are projected together in one program.
 CHUNK = 256
-# A change of transparency that is a smaller share of `RadianceTransfer.surface` is none: it moves the cone's rim by less than 1e-6.
+# A change of transparency that is a smaller fraction of `RadianceTransfer.surface` is none: it moves the cone's rim by less than 1e-6.
 FLAT = 1e-3
-# Of such changes, those of a larger share than this have a direction.
+# Of such changes, those of a larger fraction than this have a direction.
 DIRECTED = 0.1
 # Azimuth between one direction and the next, the golden angle.
 GOLDEN = math.pi * (3 - math.sqrt(5))
@@ -125,8 +125,8 @@ def _surroundings(transfer: RadianceTransfer, volume: Volume, medium: Medium, p:
     # Without a surface the axis only turns the spiral; inside of an opaque medium a gradient would be made of roundings.
     flat_there = length * width <= FLAT * transfer.surface
     axis = tuple(jnp.where(flat_there, fixed, c) for fixed, c in zip((0.0, 0.0, 1.0), axis, strict=True))
-    strength = share_of(2 * length * width, jnp.asarray(transfer.surface, length.dtype))
-    directed = share_of(2 * length * width, jnp.asarray(DIRECTED * transfer.surface, length.dtype))
+    strength = surface_weight(2 * length * width, jnp.asarray(transfer.surface, length.dtype))
+    directed = surface_weight(2 * length * width, jnp.asarray(DIRECTED * transfer.surface, length.dtype))
     strength, directed = (jnp.where(flat_there, 0.0, x) for x in (strength, directed))
     return Surroundings(jnp.max(opacity, axis=1), strength, directed, axis)
 

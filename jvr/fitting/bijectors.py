@@ -18,7 +18,7 @@ from jvr.numerics import normalise, rounded_into
 
 # How near to the end of its range a start value may lie: at the end itself a smooth map has no slope and the fit cannot leave.
 MARGIN = 1e-3
-# What is positive, or a gap between positions, stays above this share of its scale.
+# What is positive, or a gap between positions, stays above this fraction of its scale.
 LEAST = 1e-6
 
 Bounds = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
@@ -123,8 +123,8 @@ class Sigmoid(AbstractBijector):
         return self.low + (self.high - self.low) * jax.nn.sigmoid(unconstrained)
 
     def inverse(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        share = jnp.clip((value - self.low) / (self.high - self.low), MARGIN, 1 - MARGIN)
-        return jnp.log(share) - jnp.log1p(-share)
+        fraction = jnp.clip((value - self.low) / (self.high - self.low), MARGIN, 1 - MARGIN)
+        return jnp.log(fraction) - jnp.log1p(-fraction)
 
     def bounds(self, unconstrained: Float[np.ndarray, "..."]) -> Bounds:
         return _unbounded(unconstrained)

@@ -45,7 +45,7 @@ SHAPE_LIGHT = ("scene.transfer", "scene.volume", "scene.clipping", "scene.materi
 
 class Iteration(NamedTuple):
     """One line of a fit's history: `loss` is the objective, `psnr` in decibels relative to radiance 1 (of the rays in use),
-    `seconds` since the start, `rays` the share of all rays in use."""
+    `seconds` since the start, `rays` the fraction of all rays in use."""
 
     step: int
     loss: float

@@ -8,8 +8,8 @@ from jaxtyping import Float
 # Relative rounding of a column of the Jacobian, in units of its number format's epsilon. Positions in a grid of some hundred voxels
 # are rounded to as many units, and the weights of interpolation inherit that. (Against float64 the demo's columns are off by up to 140.)
 ROUNDING = 256
-# Above this share of its square in the null space a value is not determined.
-NULL_SHARE = 1e-4
+# Above this fraction of its square in the null space a value is not determined.
+NULL_FRACTION = 1e-4
 
 
 class Identifiability(NamedTuple):
@@ -57,9 +57,9 @@ def identifiability(
     rank = int(counts.sum())
     variance = float(squares) / max(measurements - rank, 1)
     spread = np.square(vectors[:, counts]) @ (1 / eigenvalues[counts])
-    null_share = np.square(vectors[:, ~counts]).sum(axis=1)
+    null_fraction = np.square(vectors[:, ~counts]).sum(axis=1)
     errors, weakest = np.full(diagonal.size, np.inf), np.zeros(diagonal.size)
-    errors[seen] = np.where(null_share > NULL_SHARE, np.inf, np.sqrt(variance * spread) * scale)
+    errors[seen] = np.where(null_fraction > NULL_FRACTION, np.inf, np.sqrt(variance * spread) * scale)
     weakest[seen] = vectors[:, 0] if seen.size else 0.0
     condition = float(eigenvalues[-1] / eigenvalues[counts][0]) if rank else np.inf
     return Identifiability(errors, variance, rank, weakest, condition)

@@ -25,7 +25,7 @@ from jvr.types import Outcome
 
 # With so many rejected steps in a row no direction is left in which float32 can tell a descent from its own rounding.
 MOST_REJECTIONS = 12
-# Sensitivities below this share of the largest count as this share, so that an unknown that no ray sees is not scaled to infinity.
+# Sensitivities below this fraction of the largest count as this fraction, so that an unknown that no ray sees is not scaled to infinity.
 FLOOR = 1e-12
 TINY = 1e-30
 # A ridge under the rounding of the Jacobian, in units of a diagonal of ones, keeps the model convex in directions that no ray sees.
@@ -55,7 +55,7 @@ class Model(NamedTuple):
         return np.clip(found, self.lower, self.upper)
 
     def steepest(self) -> float:
-        """The scaled projected gradient: the largest, over unknowns, of the square root of the share of the objective that moving this
+        """The scaled projected gradient: the largest, over unknowns, of the square root of the fraction of the objective that moving this
         unknown alone within its bounds promises to take away. Away from bounds it is the cosine between the residual and the unknown's
         column of the Jacobian (MINPACK's `gtol`)."""
         diagonal = np.diag(self.matrix)
@@ -132,8 +132,8 @@ class ChunkedLeastSquares(AbstractSolver):
     Unknowns are scaled so that the Gauss-Newton matrix has a unit diagonal: damping by a multiple of the identity is then Marquardt's.
     A level ends, and the next one with more rays begins, once a step no longer halves the objective. The last level has converged
 
-    - after an accepted step that lowered the objective, and had promised to lower it, by no more than its share `rtol`, where the scaled
-      projected gradient is at most `sqrt(rtol)`: no unknown alone promises more than that share either, or
+    - after an accepted step that lowered the objective, and had promised to lower it, by no more than its fraction `rtol`, where the scaled
+      projected gradient is at most `sqrt(rtol)`: no unknown alone promises more than that fraction either, or
     - where the objective is under the rounding of pictures.
 
     It has stalled after so many rejected steps in a row that rounding decides about them, while the model still promises more. The small

@@ -14,15 +14,15 @@ class AbstractShading(eqx.Module):
     """How a surface reflects light."""
 
     @abc.abstractmethod
-    def ambient_share(self) -> Scalar:
-        """Reflected share of ambient radiance."""
+    def ambient_reflectance(self) -> Scalar:
+        """Reflected fraction of ambient radiance."""
 
     @abc.abstractmethod
-    def surface_share(self, magnitude: Scalar) -> Scalar:
+    def surface_weight(self, magnitude: Scalar) -> Scalar:
         """How far a point whose gradient has this length is a surface, 0 ... 1; the rest reflects light as if it faced it."""
 
     @abc.abstractmethod
-    def reflect(self, share: Scalar, normal: Triple, w_o: Triple, w_i: Triple) -> tuple[Scalar, Scalar | None]:
+    def reflect(self, weight: Scalar, normal: Triple, w_o: Triple, w_i: Triple) -> tuple[Scalar, Scalar | None]:
         """Radiance towards `w_o` per irradiance from `w_i`: what the colour of the medium is multiplied with, and what is added to that
         in the colour of the light (`None` for nothing)."""
 
@@ -33,10 +33,10 @@ class AbstractScattering(eqx.Module):
     @property
     @abc.abstractmethod
     def needs_gradient(self) -> bool:
-        """Whether `share` asks for the length of the gradient."""
+        """Whether `medium_weight` asks for the length of the gradient."""
 
     @abc.abstractmethod
-    def share(self, magnitude: Scalar) -> Scalar:
+    def medium_weight(self, magnitude: Scalar) -> Scalar:
         """How far a point whose gradient has this length is a medium and not a surface, 0 ... 1."""
 
     @abc.abstractmethod
@@ -77,7 +77,7 @@ class AbstractMaterial(eqx.Module):
 class AbstractRadianceTransfer(eqx.Module):
     """How the medium around a point changes the light of the environment that reaches it."""
 
-    # Whether samples bring the light that reaches them, and not a share of all of it.
+    # Whether samples bring the light that reaches them, and not a fraction of all of it.
     exact: eqx.AbstractVar[bool]
     # What rays pick up on their way, or `None`.
     bleeding: eqx.AbstractVar[Any]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import colours, float_array, require
-from jvr.model.ranges import EXTINCTION, INCREASING, NOT_NEGATIVE, SHARE, within
+from jvr.model.ranges import EXTINCTION, INCREASING, NOT_NEGATIVE, UNIT_INTERVAL, within
 from jvr.model.transfer import AbstractTransfer, Classified, any_between
 from jvr.numerics import clamp, larger, smaller
 from jvr.types import ArrayLike, Channels, Scalar
@@ -24,7 +24,7 @@ class GradientTransfer(AbstractTransfer):
 
     takes_gradient: ClassVar[bool] = True
 
-    rgb: Float[Array, "n m 3"] = eqx.field(metadata=within(SHARE))
+    rgb: Float[Array, "n m 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
     sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
     domain: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
     magnitudes: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
@@ -89,9 +89,9 @@ class GradientOpacity(AbstractTransfer):
         # Clipped before the division: far outside of a narrow range the quotient would overflow.
         # At `low` the derivative is that of less: where there is no gradient and `low` is 0, both can only grow.
         clipped = smaller(larger(self.low, magnitude), self.high)
-        share = (clipped - self.low) / (self.high - self.low)
+        fraction = (clipped - self.low) / (self.high - self.low)
         rgb, sigma_t = self.transfer.evaluate(s)
-        scaled: Channels = tuple(sigma * share for sigma in sigma_t)
+        scaled: Channels = tuple(sigma * fraction for sigma in sigma_t)
         return Classified(rgb, scaled)
 
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:

@@ -153,8 +153,8 @@ class SpotLight(AbstractLight):
         outer, inner = jnp.deg2rad(self.outer) / 2, jnp.deg2rad(self.inner) / 2
         aside = 0.25 * sum(jnp.square(a + b) for a, b in zip(axis, w_i, strict=True))
         width = jnp.sin(outer + inner) * jnp.sin(outer - inner)
-        share = jnp.clip(divide_or_zero(jnp.square(jnp.sin(outer)) - aside, width), 0.0, 1.0)
-        falloff = share * share * (3 - 2 * share) * _falloff(distance, self.radius, self.attenuation)
+        fraction = jnp.clip(divide_or_zero(jnp.square(jnp.sin(outer)) - aside, width), 0.0, 1.0)
+        falloff = fraction * fraction * (3 - 2 * fraction) * _falloff(distance, self.radius, self.attenuation)
         return LightSample(w_i, distance, tuple(i * falloff for i in _rgb(self.intensity)))
 
     def moved(self, origin: Exact) -> "SpotLight":

@@ -1,6 +1,6 @@
 """Materials: how much of the light from each direction a point sends to the eye, in spherical harmonics.
 
-A material function `M(w_o, w_i)` includes the cosine of a surface; its integral over `w_i` is the share that is reflected. All are
+A material function `M(w_o, w_i)` includes the cosine of a surface; its integral over `w_i` is the fraction that is reflected. All are
 isotropic: with the normal as polar axis and the eye in the half-plane of azimuth 0, `M` is even in the azimuth of `w_i`, so that only the
 harmonics of `m >= 0` occur, with coefficients `rho_lm` that depend on the angle of the eye alone:
 

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.model.brdf import above, of_one_shape, share, where_or_normal
+from jvr.model.brdf import above, fraction, of_one_shape, where_or_normal
 from jvr.model.checks import float_array, require
 from jvr.model.material import About, AbstractBRDF
 from jvr.model.phase import components
-from jvr.model.ranges import SHARE, Interval, within
+from jvr.model.ranges import UNIT_INTERVAL, Interval, within
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
@@ -35,21 +35,21 @@ class MicrofacetBRDF(AbstractBRDF):
     """A material of metallic workflow, see this file's first lines.
 
     - Not metallic: plain mirrors with `F0 = reflectance_at_normal` over a tinted matte base, which receives and lets out what the mirrors
-      do not reflect: `base / pi (1 - E(w_o)) (1 - E(w_i)) / (1 - mean of E) max(n . w_i, 0)`, where `E` is the share that the mirrors
+      do not reflect: `base / pi (1 - E(w_o)) (1 - E(w_i)) / (1 - mean of E) max(n . w_i, 0)`, where `E` is the fraction that the mirrors
       reflect (Kelemen and Szirmay-Kalos 2001, A microfacet based coupled specular-matte BRDF model). With `base = 1` it reflects
       everything, at every roughness and angle.
     - Metallic: mirrors whose `F0` is the tint, so `F` is split into a tinted part `1 - s` and a plain part `s`. Light between the
       mirrors is not followed: of light straight down on white metal 3 % are lost at roughness 0.4, a half at 0.85.
 
-    **Arguments:** `base`, `reflectance_at_normal`: in [0, 1], a number or `(3,)`; `metallic`: from 0 to 1, a share of each;
+    **Arguments:** `base`, `reflectance_at_normal`: in [0, 1], a number or `(3,)`; `metallic`: from 0 to 1, a fraction of each;
     `roughness`: in [0.001, 1]. All differentiable. **Raises** `ValueError` otherwise.
     """
 
     about: ClassVar[About] = "both"
-    base: Numbers = eqx.field(metadata=within(SHARE))
-    metallic: Scalar = eqx.field(metadata=within(SHARE))
+    base: Numbers = eqx.field(metadata=within(UNIT_INTERVAL))
+    metallic: Scalar = eqx.field(metadata=within(UNIT_INTERVAL))
     roughness: Scalar = eqx.field(metadata=within(ROUGHNESS))
-    reflectance_at_normal: Numbers = eqx.field(metadata=within(SHARE))
+    reflectance_at_normal: Numbers = eqx.field(metadata=within(UNIT_INTERVAL))
 
     def __init__(
         self,
@@ -58,8 +58,8 @@ class MicrofacetBRDF(AbstractBRDF):
         roughness: ArrayLike = 0.5,
         reflectance_at_normal: ArrayLike = 0.04,
     ):
-        self.base, self.metallic = share(base, "base", (), (3,)), share(metallic, "metallic", ())
-        self.reflectance_at_normal = share(reflectance_at_normal, "reflectance_at_normal", (), (3,))
+        self.base, self.metallic = fraction(base, "base", (), (3,)), fraction(metallic, "metallic", ())
+        self.reflectance_at_normal = fraction(reflectance_at_normal, "reflectance_at_normal", (), (3,))
         self.roughness = float_array(roughness, "roughness", ())
         require(self.roughness, ROUGHNESS.holds, f"roughness must be in {ROUGHNESS}; 0.001 is as good as a mirror")
 
@@ -100,13 +100,13 @@ def visibility(cos_o: Numbers, cos_i: Numbers, alpha: Scalar) -> Numbers:
 
 
 def reflectances(alpha: Scalar) -> tuple[Float[Array, "m"], Float[Array, "m"], Float[Array, "m"]]:
-    """A table of cosines of `w_i` from 0 to 1, and the shares `A`, `B` reflected: `E = A F0 + B`, `A` the integral of `D V (1 - s)`
+    """A table of cosines of `w_i` from 0 to 1, and the fractions `A`, `B` reflected: `E = A F0 + B`, `A` the integral of `D V (1 - s)`
     over the sphere and `B` that of `D V s`.
 
     Over the mirrors that are visible from the direction, drawn evenly (Dupuy and Benyoub 2023, Sampling visible GGX normals with
     spherical caps): the integrand is then bounded by 1 at any roughness. Differentiable in `alpha`.
     """
-    # Denser at grazing angles, where the shares change fastest.
+    # Denser at grazing angles, where the fractions change fastest.
     cosine = jnp.square(jnp.linspace(0.0, 1.0, _ANGLES))
     # Denser at the end of the cap whose mirrors are steep, where smooth surfaces stop reflecting upwards.
     nodes, weights = np.polynomial.legendre.leggauss(_DOWN)
@@ -115,7 +115,7 @@ def reflectances(alpha: Scalar) -> tuple[Float[Array, "m"], Float[Array, "m"], F
     # Half a turn: the other is its mirror image.
     azimuth = jnp.pi * (jnp.arange(_AROUND) + 0.5) / _AROUND
 
-    def shares(cos_o: Scalar) -> tuple[Scalar, Scalar]:
+    def fractions(cos_o: Scalar) -> tuple[Scalar, Scalar]:
         sin_o = jnp.sqrt(1.0 - cos_o * cos_o)
         (x, _, z), _ = direction_and_length((alpha * sin_o, jnp.zeros_like(cos_o), cos_o))
         # A point of the cap above -z, of height (1 + z) down - z, plus the direction; the radius in a form that does not cancel.
@@ -131,7 +131,7 @@ def reflectances(alpha: Scalar) -> tuple[Float[Array, "m"], Float[Array, "m"], F
         grazing = _schlick(seen)
         return jnp.sum(open_ * (1.0 - grazing)), jnp.sum(open_ * grazing)
 
-    return cosine, *jax.vmap(shares)(cosine)
+    return cosine, *jax.vmap(fractions)(cosine)
 
 
 def _under_coat(f0: Scalar, table: tuple[Numbers, Numbers, Numbers], cos_o: Numbers, cos_i: Numbers) -> Numbers:

@@ -191,9 +191,9 @@ class _End(NamedTuple):
 
 class _Cut(NamedTuple):
     """How a segment divides into a first stretch (all of it, where both ends are in one interval), two blocks of whole intervals and
-    a last stretch: `first`, `block`, `block_too`, `last` are their shares of the segment, and `whole` says whether there are blocks.
+    a last stretch: `first`, `block`, `block_too`, `last` are their fractions of the segment, and `whole` says whether there are blocks.
 
-    `of_a`, `of_b`: weights of the entries below and above in the lower and in the upper end. `covers_a`, `covers_b`: the shares of
+    `of_a`, `of_b`: weights of the entries below and above in the lower and in the upper end. `covers_a`, `covers_b`: the fractions of
     their intervals that the stretches cover.
     """
 
@@ -267,14 +267,14 @@ def _ramp(sigma: Array, sigma_rise: Array, colour: Array, colour_rise: Array) ->
     return _Stretch(sigma, sigma * colour + sigma_rise * colour_rise * (1 / 12), lag)
 
 
-def _union(share: Array, one: _Stretch, share_too: Array, other: _Stretch) -> _Stretch:
-    """One stretch and then another, averaged over a whole of which they are these shares."""
-    sigma, sigma_too = share * one.sigma, share_too * other.sigma
-    emission, emission_too = share * one.emission, share_too * other.emission
+def _union(fraction: Array, one: _Stretch, fraction_too: Array, other: _Stretch) -> _Stretch:
+    """One stretch and then another, averaged over a whole of which they are these fractions."""
+    sigma, sigma_too = fraction * one.sigma, fraction_too * other.sigma
+    emission, emission_too = fraction * one.emission, fraction_too * other.emission
     # The middle of the union is farther back than that of the first by half of the other's depth, and the other way round.
     apart = 0.5 * (emission_too * sigma - emission * sigma_too)
     return _Stretch(
-        sigma + sigma_too, emission + emission_too, jnp.square(share) * one.lag + jnp.square(share_too) * other.lag + apart
+        sigma + sigma_too, emission + emission_too, jnp.square(fraction) * one.lag + jnp.square(fraction_too) * other.lag + apart
     )
 
 
@@ -285,7 +285,7 @@ _Channel = tuple[Scalar, Scalar, Scalar, Scalar]
 def _nearby(cut: _Cut, sigma: _Profile, colour: _Profile) -> _Channel:
     """Both ends in one interval, or in neighbouring ones.
 
-    The union of both stretches, in terms of the changes, which are exact where they are small: shares of a short segment are quotients
+    The union of both stretches, in terms of the changes, which are exact where they are small: fractions of a short segment are quotients
     of small lengths with large derivatives, and a difference of means beside them would be all rounding.
     """
     last = cut.last

@@ -10,7 +10,7 @@ from jvr.model.environment import EnvironmentLight
 from jvr.model.light import AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
-from jvr.model.ranges import SHARE, within
+from jvr.model.ranges import UNIT_INTERVAL, within
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import ClippingBox, Volume
 from jvr.types import ArrayLike, Vector
@@ -44,7 +44,7 @@ class Scene(eqx.Module):
 
     volume: Volume
     transfer: AbstractTransfer
-    background: Vector | None = eqx.field(metadata=within(SHARE))
+    background: Vector | None = eqx.field(metadata=within(UNIT_INTERVAL))
     optical: AbstractOpticalModel
     clipping: ClippingBox | None
     lights: tuple[AbstractLight | AmbientLight, ...]

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import colours, float_array, require
-from jvr.model.ranges import EXTINCTION, INCREASING, POSITIVE, SHARE, within
+from jvr.model.ranges import EXTINCTION, INCREASING, POSITIVE, UNIT_INTERVAL, within
 from jvr.numerics import clamp, divide_or_zero, read_run
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
@@ -78,7 +78,7 @@ class LinearTransfer(AbstractTable):
     """
 
     positions: Float[Array, "n"] = eqx.field(metadata=within(INCREASING))
-    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(SHARE))
+    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
     sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
 
     def __init__(self, positions: ArrayLike, rgb: ArrayLike, sigma_t: ArrayLike):
@@ -114,7 +114,7 @@ class LutTransfer(AbstractTable):
     differentiable. **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
     """
 
-    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(SHARE))
+    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
     sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
     domain: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
 
@@ -158,7 +158,7 @@ class GaussianTransfer(AbstractTransfer):
     center: Float[Array, "g"]
     width: Float[Array, "g"] = eqx.field(metadata=within(POSITIVE))
     height: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
-    rgb: Float[Array, "g 3"] = eqx.field(metadata=within(SHARE))
+    rgb: Float[Array, "g 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
 
     def __init__(self, center: ArrayLike, width: ArrayLike, height: ArrayLike, rgb: ArrayLike):
         self.center = float_array(center, "center", (None,))

@@ -202,7 +202,7 @@ def _around(x: Num[Array, "x y z"]) -> Num[Array, "x y z"]:
 
 
 def typical_range(flat: np.ndarray, *, few: float = FEW, least: int = 1) -> tuple[float, float]:
-    """Smallest and largest of some numbers, but for a few that lie far out: no more than a share `few` of them, or `least`, more than
+    """Smallest and largest of some numbers, but for a few that lie far out: no more than a fraction `few` of them, or `least`, more than
     the range of all others but a few thousandths beyond it. One hot voxel does not decide what a range is cut into."""
     flat = flat.reshape(-1)
     low, high = float(flat.min()), float(flat.max())

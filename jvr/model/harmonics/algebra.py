@@ -87,8 +87,8 @@ def two_double_products(material: ArrayLike, light: ArrayLike, transfer: ArrayLi
     material, light, transfer = as_floats(material), as_floats(light), as_floats(transfer)
     total = light[0] * np.sqrt(4 * np.pi)
     there = total != 0
-    share = jnp.sum(transfer * light, axis=0) / jnp.where(there, total, 1.0)
-    return jnp.where(there, jnp.sum(material * light, axis=0) * share, 0.0)
+    fraction = jnp.sum(transfer * light, axis=0) / jnp.where(there, total, 1.0)
+    return jnp.where(there, jnp.sum(material * light, axis=0) * fraction, 0.0)
 
 
 @functools.cache
