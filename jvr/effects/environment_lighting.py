@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from jvr.effects.own_shadow import OwnShadow, Segment, own_shadow_of
 from jvr.effects.shading import surface_weight
 from jvr.model.harmonics.basis import band_of, basis, count
-from jvr.model.material import About, HarmonicMaterial, Lobe
+from jvr.model.material import HarmonicMaterial, Lobe, SymmetryAxis
 from jvr.model.scene import Scene
 from jvr.numerics import clamp, direction_and_length, dot, larger
 from jvr.types import Channels, Scalar, Triple
@@ -32,25 +32,25 @@ class PlaneTable(eqx.Module):
 
     rows: Float[Array, "classes polar row"]
     shape: tuple[int, int, int] = eqx.field(static=True)
-    about: About = eqx.field(static=True)
+    symmetry_axis: SymmetryAxis = eqx.field(static=True)
 
     @classmethod
     def of(cls, lobe: Lobe, order: int) -> "PlaneTable":
         """The table of a lobe, up to an order."""
         rho = lobe.coefficients[:, :, : order + 1, : order + 1]
         bands = rho.shape[2]
-        if lobe.about == "both":
+        if lobe.symmetry_axis == "both":
             rho = jnp.einsum("cplmh,lmk->cplkh", rho, jnp.asarray(_in_plane(bands - 1), rho.dtype))
         else:
             # Y_l0 at its own pole.
             rho = rho / jnp.sqrt((2 * jnp.arange(bands, dtype=rho.dtype) + 1) / (4 * math.pi))[:, None, None]
         classes, polar, *shape = rho.shape
-        return cls(rho.reshape(classes, polar, -1), (shape[0], shape[1], shape[2]), lobe.about)
+        return cls(rho.reshape(classes, polar, -1), (shape[0], shape[1], shape[2]), lobe.symmetry_axis)
 
     def directions(self, normal: Triple, across: Triple, w_o: Triple) -> list[Triple]:
         """Where the light is looked at."""
-        if self.about != "both":
-            return [normal if self.about == "normal" else w_o]
+        if self.symmetry_axis != "both":
+            return [normal if self.symmetry_axis == "normal" else w_o]
         angles = [k * math.pi / self.shape[1] for k in range(self.shape[1])]
         return [tuple(math.cos(a) * n + math.sin(a) * t for n, t in zip(normal, across, strict=True)) for a in angles]
 
@@ -77,7 +77,7 @@ class EnvironmentLighting(eqx.Module):
 
     light: Float[Array, "bands 3"] | None
     tinted: PlaneTable | None
-    plain: PlaneTable | None
+    unmodulated: PlaneTable | None
     positions: Float[Array, "classes"]
     threshold: Scalar
     clamped: bool = eqx.field(static=True)
@@ -86,7 +86,7 @@ class EnvironmentLighting(eqx.Module):
     @property
     def needs_gradient(self) -> bool:
         """Whether what is reflected depends on a normal."""
-        return any(table is not None and table.about != "eye" for table in (self.tinted, self.plain))
+        return any(table is not None and table.symmetry_axis != "eye" for table in (self.tinted, self.unmodulated))
 
     def reflect(
         self,
@@ -121,11 +121,11 @@ class EnvironmentLighting(eqx.Module):
             assert here is not None
             kept = self.shadow.remaining(s, magnitude, normal, w_o, here, solid)
         parts = []
-        for table in (self.tinted, self.plain):
+        for table in (self.tinted, self.unmodulated):
             if table is None:
                 parts.append((zero,) * 3)
                 continue
-            counts = zero + 1 if table.about == "eye" else surface
+            counts = zero + 1 if table.symmetry_axis == "eye" else surface
             scales = [kept[0], *(tuple(counts * k for k in band) for band in kept[1:])]
             radiance = _integrate(table.at(place, theta), coefficients, table.directions(normal, across, w_o), scales)
             radiance = tuple(c * r for c, r in zip(fraction, radiance, strict=True))
@@ -158,9 +158,15 @@ def environment_lighting(
     shadow: OwnShadow | None = None,
 ) -> EnvironmentLighting:
     """`EnvironmentLighting` up to an order; `from_samples`: each sample brings the coefficients of its light."""
-    tinted, plain = (None if lobe is None else PlaneTable.of(lobe, order) for lobe in (material.tinted, material.plain))
+    tinted, unmodulated = (None if lobe is None else PlaneTable.of(lobe, order) for lobe in (material.tinted, material.plain))
     return EnvironmentLighting(
-        None if from_samples else light[: count(order)], tinted, plain, material.positions, material.threshold, clamped, shadow
+        None if from_samples else light[: count(order)],
+        tinted,
+        unmodulated,
+        material.positions,
+        material.threshold,
+        clamped,
+        shadow,
     )
 
 

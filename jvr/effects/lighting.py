@@ -87,9 +87,9 @@ class LitShader(OpticalShader):
         if self.environment is not None:
             around = transmittances[len(self.lights)] if len(transmittances) > len(self.lights) else ()
             here = Segment(medium, sample.gradient, dt)
-            tinted, plain = self.environment.reflect(sample.s, magnitude, normal, w_o, around, cut, here)
+            tinted, unmodulated = self.environment.reflect(sample.s, magnitude, normal, w_o, around, cut, here)
             factor = [f + reflects * c for f, c in zip(factor, tinted, strict=True)]
-            added = [b + reflects * c for b, c in zip(added, plain, strict=True)]
+            added = [b + reflects * c for b, c in zip(added, unmodulated, strict=True)]
         return tuple(factor), tuple(added)
 
 

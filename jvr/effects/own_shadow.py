@@ -3,7 +3,7 @@
 Light of radiance transfer is known at nodes that lie further apart than a surface is thick, and so it is that above the surface. What
 such nodes miss is known at the sample: the scalar goes linearly along the normal, so that the optical depth `tau` from the sample up to
 where light comes from is an integral of the transfer function, and light at an angle of cosine `mu` to the normal keeps `exp(-tau / mu)`
-of itself. Under a matte surface band `l` of the light keeps
+of itself. Under a diffuse surface band `l` of the light keeps
 
     f_l = integral_0^1 mu P_l(mu) exp(-tau / mu) dmu / integral_0^1 mu P_l(mu) dmu:  2 E_3,  3 E_4,  4 (3 E_5 - E_3)
 
@@ -60,8 +60,8 @@ class OwnShadow(eqx.Module):
             colour = here.medium.rgb
             if self.albedo is not None:
                 # The medium above is seen from below, along its normal.
-                tinted, plain = self.albedo.reflect(s, magnitude, normal, normal, ())
-                colour = tuple(c * a + b for c, a, b in zip(colour, tinted, plain, strict=True))
+                tinted, unmodulated = self.albedo.reflect(s, magnitude, normal, normal, ())
+                colour = tuple(c * a + b for c, a, b in zip(colour, tinted, unmodulated, strict=True))
             return [tuple(1 - shadow * (1 - c) for c in colour) for shadow in shadows]
         return [(1 - shadow,) for shadow in shadows]
 

@@ -57,7 +57,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
     - `scattering`: `jvr.Dipole(...)` or `None`: each node gets the mean of what its neighbours receive, weighted with the dipole's diffuse
       reflectance; `neighbourhood`: its radius, as a fraction of the volume's longest side.
     - `exact`: the triple product of material, light and transfer at each sample. Without it, nodes know which fraction of the light arrives
-      of all that a matte surface reflects that faces where the medium there does (with a material without normal: of all light), and the
+      of all that a diffuse surface reflects that faces where the medium there does (with a material without normal: of all light), and the
       sample multiplies that with its own product of material and light. Both are the same where nothing else is in the way.
     - `chromaticity`: `None`, or the order to keep colour differences at, where rays carry colour; luminance keeps `order`.
     - `step`, `growth`: first step in voxels, and the ratio of a step to the one before; `termination`: a ray ends once its transmittance

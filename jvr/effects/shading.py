@@ -24,7 +24,7 @@ EXPONENT = Interval(low=1.0)
 
 
 class Lambert(AbstractShading):
-    """Matte surfaces: `ambient L_ambient + diffuse E max(n . w_i, 0)`, times the colour of the medium.
+    """Diffuse (Lambert) surfaces: `ambient L_ambient + diffuse E max(n . w_i, 0)`, times the colour of the medium.
 
     **Arguments:**
 
@@ -66,10 +66,10 @@ class Lambert(AbstractShading):
         normal = self._turned(normal, w_o)
         facing = jnp.maximum(dot(normal, w_i), 0.0)
         diffuse = self.diffuse * (1 + weight * (facing - 1))
-        gloss = self.gloss(normal, w_o, w_i)
-        return diffuse, None if gloss is None else weight * jnp.where(facing > 0, gloss, 0.0)
+        specular = self.specular_lobe(normal, w_o, w_i)
+        return diffuse, None if specular is None else weight * jnp.where(facing > 0, specular, 0.0)
 
-    def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
+    def specular_lobe(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         """What is reflected in the colour of the light."""
         return None
 
@@ -81,7 +81,7 @@ class Lambert(AbstractShading):
 
 
 class Phong(Lambert):
-    """Glossy surfaces: Lambert's, and `specular E max(r . w_o, 0)^shininess` in the colour of the light, with `r` the mirrored light.
+    """Specular (Phong) surfaces: Lambert's, and `specular E max(r . w_o, 0)^shininess` in the colour of the light, `r` the mirrored light.
 
     **Arguments:** as `Lambert`, and `specular`, not negative; `shininess`, at least 1. Each a number or `jvr.ByValue`.
     """
@@ -103,7 +103,7 @@ class Phong(Lambert):
         self.specular = _fraction(specular, "specular")
         self.shininess = coefficient(shininess, "shininess", EXPONENT.holds, "shininess must be an exponent of at least 1")
 
-    def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
+    def specular_lobe(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         twice = 2 * dot(normal, w_i)
         mirrored = tuple(twice * n - w for n, w in zip(normal, w_i, strict=True))
         return self.specular * power_of_cosine(mirrored, w_o, self.shininess)
@@ -125,7 +125,7 @@ class BlinnPhong(Phong):
     ):
         super().__init__(ambient, diffuse, specular, shininess, threshold=threshold, two_sided=two_sided)
 
-    def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
+    def specular_lobe(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         half, length = direction_and_length(tuple(o + i for o, i in zip(w_o, w_i, strict=True)))
         return jnp.where(length > 0, self.specular * power_of_cosine(normal, half, self.shininess), 0.0)
 

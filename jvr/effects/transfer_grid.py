@@ -181,7 +181,7 @@ def scattered(scene: Scene, projected: ProjectedTransfer) -> ProjectedTransfer:
 def _fractions(
     facing: Float[Array, "x y z 3"], coefficients: Float[Array, "x y z channels bands"], light: Float[Array, "others 3"]
 ) -> Float[Array, "x y z 3"]:
-    """The fraction of each colour of the light that arrives, of all that a matte surface would reflect that faces where the node does; 0
+    """The fraction of each colour of the light that arrives, of all that a diffuse surface would reflect that faces where the node does; 0
     where there is no light."""
     matrix = product_matrix(light, math.isqrt(coefficients.shape[-1]) - 1, 2)
     channels = coefficients.shape[3]

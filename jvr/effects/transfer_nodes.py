@@ -212,8 +212,8 @@ def _colour(rgb: Triple, sample: Any, albedo: EnvironmentLighting | None, w_o: T
 
     # A material without a normal asks for no gradient.
     gradient = sample.gradient or (jnp.zeros_like(sample.s),) * 3
-    tinted, plain = jax.vmap(one)(sample.s, gradient, w_o)
-    return tuple(c * a + b for c, a, b in zip(rgb, tinted, plain, strict=True))
+    tinted, unmodulated = jax.vmap(one)(sample.s, gradient, w_o)
+    return tuple(c * a + b for c, a, b in zip(rgb, tinted, unmodulated, strict=True))
 
 
 def _least(tau: Channels) -> Numbers:

@@ -83,8 +83,8 @@ class EnvironmentLight(eqx.Module):
         require(jnp.linalg.norm(axis), lambda n: np.isfinite(n) & (n > 0), "towards must be a direction, not zero")
         rgb = jnp.broadcast_to(radiances(radiance, "radiance"), (3,))
         kernel = jnp.stack(cap(2 * jnp.square(jnp.sin(jnp.deg2rad(angle) / 2)), order))
-        about = harmonics.evaluate(order, normalise(axis)[None])[0]
-        return cls(harmonics.convolve(about, kernel)[:, None] * rgb)
+        lobe = harmonics.evaluate(order, normalise(axis)[None])[0]
+        return cls(harmonics.convolve(lobe, kernel)[:, None] * rgb)
 
     @property
     def order(self) -> int:
