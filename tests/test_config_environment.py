@@ -297,7 +297,7 @@ def test_radiance_transfer_with_the_materials_colour_is_that_of_the_start():
     assert found.keeps_transfer
     assert found.scene.radiance_transfer.is_frozen
     assert isinstance(found.scene.material, jvr.LambertBRDF)
-    assert found.scene.radiance_transfer.outdated(found.scene) == ()
+    assert found.scene.radiance_transfer.stale(found.scene) == ()
 
 
 @pytest.mark.slow

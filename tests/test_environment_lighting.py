@@ -354,7 +354,7 @@ def test_what_is_kept_may_be_deleted_at_any_time(tmp_path):
 
 @pytest.mark.parametrize("bleeding", [None, pytest.param(jvr.MaterialBleeding(), marks=pytest.mark.slow)])
 def test_what_was_computed_for_another_scene_is_refused(bleeding):
-    """With arrays at hand, and where the scene is an argument of a compiled function."""
+    """With concrete arrays, and where the scene is an argument of a compiled function."""
     frozen = jvr.precompute(scene(transfer=jvr.RadianceTransfer(rays=4, resolution=0.4, bleeding=bleeding)))
     camera, volume = perspective(frozen.volume, width=4, height=4), frozen.volume
     compiled_render = compiled(lambda s: jvr.render(s, camera, SETTINGS).rgb)
@@ -363,7 +363,7 @@ def test_what_was_computed_for_another_scene_is_refused(bleeding):
     # Equal numbers in other arrays are no other scene.
     np.testing.assert_array_equal(compiled_render(jax.tree.map(jnp.array, frozen)), expected)
     relit = dataclasses.replace(frozen, environment=light(seed=7))
-    assert relit.radiance_transfer.outdated(relit) == ()
+    assert relit.radiance_transfer.stale(relit) == ()
     changed = {
         "transfer function": dataclasses.replace(frozen, transfer=linear_transfer(seed=5)),
         "volume": dataclasses.replace(frozen, volume=jvr.Volume(voxels(volume.shape, seed=9), OBLIQUE)),
@@ -380,7 +380,7 @@ def test_what_was_computed_for_another_scene_is_refused(bleeding):
     for name, other in changed.items():
         with pytest.raises(ValueError, match=r"another .*jvr.precompute\(scene\) again"):
             jvr.render(other, camera, SETTINGS)
-        assert other.radiance_transfer.outdated(other), name
+        assert other.radiance_transfer.stale(other), name
     for name in ("transfer function", "one voxel"):
         with pytest.raises(Exception, match=r"another .*jvr.precompute\(scene\) again"):
             jax.block_until_ready(compiled_render(changed[name]))

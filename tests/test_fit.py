@@ -132,8 +132,8 @@ def test_normal_equations_have_the_gradient_of_the_objective(loss, names, x64):
     observations = observe(scene, CAMERAS, [0.8 * image for image in IMAGES], None, SETTINGS).dealt(720)
     values = unknowns.unconstrained_from_model(model)
     normal = normal_equations(problem, values, observations)
-    pieces = jax.tree.map(lambda x: x[None], observations)
-    objective, gradient = jax.value_and_grad(lambda v: value(problem, v, pieces, jnp.ones(())))(values)
+    tiles = jax.tree.map(lambda x: x[None], observations)
+    objective, gradient = jax.value_and_grad(lambda v: value(problem, v, tiles, jnp.ones(())))(values)
     np.testing.assert_allclose(normal.loss, objective, rtol=1e-10)
     np.testing.assert_allclose(2 * normal.vector, gradient, rtol=1e-7, atol=1e-9 * np.abs(gradient).max())
 

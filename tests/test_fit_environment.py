@@ -167,11 +167,11 @@ def both_ways(one, unknowns):
     observations = observe(one, cameras, images, None, SETTINGS).dealt(128)
     total = jnp.asarray(3.0 * observations.size)
     around = light_tangents(problem, values)
-    vectors = [normal_equations(problem, values, piece, around).vector for piece in observations.pieces(128)]
+    vectors = [normal_equations(problem, values, tile, around).vector for tile in observations.tiles(128)]
     # In unconstrained space every value is itself.
     identity = eqx.tree_at(lambda p: p.unknowns.bijectors, problem, tuple(jvr.Identity() for _ in problem.unknowns.bijectors))
-    pieces = jax.tree.map(lambda x: x.reshape(-1, 128, *x.shape[1:]), observations)
-    gradient = compiled(jax.grad(lambda v: value(identity, v, pieces, total)))(values)
+    tiles = jax.tree.map(lambda x: x.reshape(-1, 128, *x.shape[1:]), observations)
+    gradient = compiled(jax.grad(lambda v: value(identity, v, tiles, total)))(values)
     return 2 * sum(np.asarray(v, np.float64) for v in vectors) / float(total), gradient
 
 

@@ -19,7 +19,7 @@ class Grid(eqx.Module):
 
     @classmethod
     def of(cls, nodes: Float[Array, "x y z channels"]) -> "Grid":
-        """The grid of nodes at whole positions."""
+        """The grid of nodes at integer positions."""
         nx, ny, nz, channels = nodes.shape
         return cls(nodes.reshape(-1, channels), (nx - 1, ny - 1, nz - 1))
 

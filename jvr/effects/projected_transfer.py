@@ -21,7 +21,7 @@ class ProjectedTransfer(eqx.Module):
     - `solid`: `(x, y, z)`, how much of an opaque surface there is, from above 0 to 1; 0 where nothing is near and nothing was projected.
     - `facing`: `(x, y, z, 3)`, the unit vector away from the medium, shorter where that has hardly a direction.
     - `transfer`: the transfer function of that time, which the shadow of surfaces on themselves is found with.
-    - `made_for`: checksums of what it was made of (`jvr.model.kept.content`).
+    - `cache_key`: checksums of what it was made of (`jvr.model.kept.content`).
     - `scattered`: whether the scattering pass has been made.
     - `pinned`: whether it stays as it is although the scene is another.
     """
@@ -31,7 +31,7 @@ class ProjectedTransfer(eqx.Module):
     solid: Float[Array, "x y z"]
     facing: Float[Array, "x y z 3"]
     transfer: AbstractTransfer
-    made_for: UInt32[Array, "parts 2"]
+    cache_key: UInt32[Array, "parts 2"]
     scattered: bool = eqx.field(static=True, default=False)
     pinned: bool = eqx.field(static=True, default=False)
 
@@ -50,9 +50,9 @@ class ProjectedTransfer(eqx.Module):
         """Memory of the coefficients."""
         return sum(x.size * x.dtype.itemsize for x in (self.luminance, self.chroma, self.solid, self.facing) if x is not None)
 
-    def is_for(self, made_for: UInt32[Array | np.ndarray, "parts 2"]) -> Any:
+    def is_for(self, cache_key: UInt32[Array | np.ndarray, "parts 2"]) -> Any:
         """Whether it was made of what has these checksums: a `bool`, or a traced one."""
-        now, then = made_for, self.made_for
+        now, then = cache_key, self.cache_key
         if now.shape != then.shape:
             return False
         if isinstance(now, Tracer) or isinstance(then, Tracer):

@@ -106,10 +106,10 @@ class RadianceTransfer(AbstractRadianceTransfer):
             raise TypeError(f"bleeding must be jvr.TransferBleeding(), jvr.MaterialBleeding() or None, not {bleeding!r}")
         if not isinstance(scattering, Dipole | None):
             raise TypeError(f'scattering must be a jvr.Dipole, such as jvr.Dipole.preset("skin1"), or None, not {scattering!r}')
-        whole = lambda x: isinstance(x, int) and not isinstance(x, bool)
+        is_integer = lambda x: isinstance(x, int) and not isinstance(x, bool)
         wrong = {
-            "order must be a whole number from 0 to 10": not whole(order) or not 0 <= order <= 10,
-            "rays must be a whole number of at least 1": not whole(rays) or rays < 1,
+            "order must be a whole number from 0 to 10": not is_integer(order) or not 0 <= order <= 10,
+            "rays must be a whole number of at least 1": not is_integer(rays) or rays < 1,
             "memory must be a positive number of bytes": not memory > 0,
             "resolution must be above 0 and at most 1 nodes for each voxel": not 0 < resolution <= 1,
             "neighbourhood must be above 0 and at most 1 of the longest side": not 0 < neighbourhood <= 1,
@@ -128,15 +128,15 @@ class RadianceTransfer(AbstractRadianceTransfer):
         self.termination, self.surface = float(termination), float(surface)
         self.bleeding, self.scattering, self.projected = bleeding, scattering, None
 
-    def outdated(self, scene: Any) -> tuple[str, ...]:
-        if self.projected is None or np.all(self.projected.is_for(self.made_for(scene))):
+    def stale(self, scene: Any) -> tuple[str, ...]:
+        if self.projected is None or np.all(self.projected.is_for(self.cache_key(scene))):
             return ()
         return (self._stale,)
 
     def checked(self, scene: Any) -> "RadianceTransfer":
         if self.projected is None:
             return self
-        fits, is_pinned = self.projected.is_for(self.made_for(scene)), self.projected.pinned
+        fits, is_pinned = self.projected.is_for(self.cache_key(scene)), self.projected.pinned
         if isinstance(fits, Tracer):
             if is_pinned:
                 return self
@@ -212,7 +212,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
                 f"a resolution of {fits:.2f} fits, or raise memory"
             )
 
-    def made_for(self, scene: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
+    def cache_key(self, scene: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
         """Checksums of all that a projection depends on."""
         volume = scene.volume
         parts = [volume.values, volume.gaps, volume.slope, volume.intercept, volume.world_from_grid, volume.interpolation]

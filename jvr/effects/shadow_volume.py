@@ -121,6 +121,6 @@ def samples_a_layer(scene: Scene, layers: int) -> int:
 
 
 def check_size(value: int, name: str, least: int) -> None:
-    """**Raises** `ValueError` unless `value` is a whole number of at least `least`."""
+    """**Raises** `ValueError` unless `value` is an integer of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ValueError(f"{name} must be a whole number of at least {least}, not {value!r}")

@@ -161,9 +161,9 @@ def finished(
     """What was projected, scattered and with its colour differences apart where the scene asks for that."""
     transfer = transfer_of(scene)
     shape = transfer.shape(scene.volume)
-    made_for = jnp.asarray(transfer.made_for(scene))
+    cache_key = jnp.asarray(transfer.cache_key(scene))
     grid, around = coefficients.reshape(*shape, *coefficients.shape[1:]), around.reshape(*shape, 4)
-    projected = ProjectedTransfer(grid, None, around[..., 0], around[..., 1:], scene.transfer, made_for)
+    projected = ProjectedTransfer(grid, None, around[..., 0], around[..., 1:], scene.transfer, cache_key)
     projected = projected if transfer.scattering is None else scattered(scene, projected)
     return projected if transfer.chromaticity is None else projected.separated(transfer.chromaticity)
 

@@ -40,11 +40,11 @@ class ValueFunction(eqx.Module):
     """The objective as Optimistix calls it."""
 
     problem: Problem
-    pieces: Observations
+    tiles: Observations
     total: Scalar
 
     def __call__(self, unconstrained: Float[Array, "unknowns"], args: None) -> tuple[Scalar, None]:
-        return value(self.problem, unconstrained, self.pieces, self.total), None
+        return value(self.problem, unconstrained, self.tiles, self.total), None
 
 
 class ImageValueFunction(eqx.Module):
@@ -62,11 +62,11 @@ class ResidualFunction(eqx.Module):
     """`residuals` as Optimistix calls them."""
 
     problem: Problem
-    pieces: Observations
+    tiles: Observations
     total: Scalar
 
     def __call__(self, unconstrained: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
-        return residuals(self.problem, unconstrained, self.pieces, self.total), None
+        return residuals(self.problem, unconstrained, self.tiles, self.total), None
 
 
 class Evaluator:
@@ -78,7 +78,7 @@ class Evaluator:
         self.rays = observations.size
         self.total = _total(observations)
         self.levels = _levels(problem, observations, chunk)
-        self.pieces = jax.tree.map(lambda x: on_devices(x.reshape(-1, chunk, *x.shape[1:])), observations)
+        self.tiles = jax.tree.map(lambda x: on_devices(x.reshape(-1, chunk, *x.shape[1:])), observations)
         self.functions = self._functions(tuple(cameras), tuple(jnp.asarray(image) for image in images))
 
     def expand(self, level: int, unconstrained: Float[Array, "unknowns"]) -> tuple[float, Normal]:
@@ -145,7 +145,7 @@ class Evaluator:
             mean = loss
         else:
             mean = float(
-                _mean_squares(self.problem.least_squares(), jnp.asarray(unconstrained), self.pieces, jnp.asarray(self.total))
+                _mean_squares(self.problem.least_squares(), jnp.asarray(unconstrained), self.tiles, jnp.asarray(self.total))
             )
         return float(-10 * np.log10(max(mean, 1e-20)))
 
@@ -153,15 +153,15 @@ class Evaluator:
         """The normal equations of all chunks together, in float64."""
         problem = problem or self.problem
         around = light_tangents(problem, values)
-        parts = [normal_equations(problem, values, piece, around) for piece in observations.pieces(self.chunk)]
+        parts = [normal_equations(problem, values, tile, around) for tile in observations.tiles(self.chunk)]
         return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
 
     def _functions(self, cameras: tuple[AbstractCamera, ...], images: tuple[Array, ...]) -> Functions:
         if isinstance(self.problem.loss, DSSIM):
             function = ImageValueFunction(self.problem, cameras, images)
         else:
-            function = ValueFunction(self.problem, self.pieces, jnp.asarray(self.total))
-        residuals = ResidualFunction(self.problem, self.pieces, jnp.asarray(self.total))
+            function = ValueFunction(self.problem, self.tiles, jnp.asarray(self.total))
+        residuals = ResidualFunction(self.problem, self.tiles, jnp.asarray(self.total))
         levels = tuple(functools.partial(self.expand, i) for i in range(len(self.levels)))
         return Functions(function, residuals, levels, self.limits, self.quadratic, self._rounding())
 

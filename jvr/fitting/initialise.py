@@ -54,8 +54,8 @@ def colours_given_extinction(
     chunk = min(16_384, -(-observations.size // shares()))
     start = jnp.ravel(scene.transfer.rgb)
     matrix, vector = np.zeros((start.size,) * 2), np.zeros(start.size)
-    for piece in observations.dealt(chunk).pieces(chunk):
-        normal = normal_equations(problem, start, piece)
+    for tile in observations.dealt(chunk).tiles(chunk):
+        normal = normal_equations(problem, start, tile)
         matrix += np.asarray(normal.matrix, np.float64)
         vector += np.asarray(normal.vector, np.float64)
     scale = max(np.diag(matrix).max(), np.finfo(float).tiny)

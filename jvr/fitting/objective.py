@@ -52,7 +52,7 @@ class Problem(eqx.Module):
         stored = lambda problem: problem.samples.stored
         return eqx.tree_at(stored, self, None), self.samples.stored
 
-    def whole(self, stored: Array | None) -> "Problem":
+    def reassembled(self, stored: Array | None) -> "Problem":
         """What `apart` undoes on one device."""
         if stored is None:
             return self
@@ -64,7 +64,7 @@ class Problem(eqx.Module):
 
 
 class _Channel(eqx.Module):
-    """One colour channel of a piece: for each ray `r`, `w` and `w rho(r)` of `Normal`, and its row for the unknowns in `columns`."""
+    """One colour channel of a tile: for each ray `r`, `w` and `w rho(r)` of `Normal`, and its row for the unknowns in `columns`."""
 
     residual: Float[Array, "rays"]
     weight: Float[Array, "rays"]
@@ -95,28 +95,28 @@ def predict(problem: Problem, model: ExposedModel, gathered: Marched, length: Fl
 
 
 @eqx.filter_jit
-def value(problem: Problem, unconstrained: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Scalar:
-    """Mean loss over all pixels plus priors, in unconstrained space. `pieces` has a leading axis of chunks."""
+def value(problem: Problem, unconstrained: Float[Array, "unknowns"], tiles: Observations, total: Scalar) -> Scalar:
+    """Mean loss over all pixels plus priors, in unconstrained space. `tiles` has a leading axis of chunks."""
     model = problem.unknowns.model_from_unconstrained(problem.model, unconstrained)
     prepared = prepare_in_fit(model.scene, problem.settings, problem.skips)
     shared, stored = problem.apart()
 
     def share(shared: tuple[Problem, ExposedModel, Prepared], rays: tuple[Array | None, Observations]) -> Array:
         problem, model, prepared = shared
-        stored, pieces = rays
+        stored, tiles = rays
 
-        def add_piece(sum_: Scalar, piece: Observations) -> tuple[Scalar, None]:
-            r = residual(problem.whole(stored), model, piece, prepared)
-            return sum_ + sum(jnp.sum(piece.weight * problem.loss.value(c)) for c in r), None
+        def add_tile(sum_: Scalar, tile: Observations) -> tuple[Scalar, None]:
+            r = residual(problem.reassembled(stored), model, tile, prepared)
+            return sum_ + sum(jnp.sum(tile.weight * problem.loss.value(c)) for c in r), None
 
-        return jax.lax.scan(add_piece, jnp.zeros((), unconstrained.dtype), pieces)[0][None]
+        return jax.lax.scan(add_tile, jnp.zeros((), unconstrained.dtype), tiles)[0][None]
 
-    loss = jnp.sum(over_rays(share, (shared, model, prepared), (stored, pieces)))
+    loss = jnp.sum(over_rays(share, (shared, model, prepared), (stored, tiles)))
     return loss / total + prior(problem, model)
 
 
 @eqx.filter_jit
-def residuals(problem: Problem, unconstrained: Float[Array, "unknowns"], pieces: Observations, total: Scalar) -> Array:
+def residuals(problem: Problem, unconstrained: Float[Array, "unknowns"], tiles: Observations, total: Scalar) -> Array:
     """The whole residual vector, scaled to a squared length of the mean squared error; priors have no residuals."""
     model = problem.unknowns.model_from_unconstrained(problem.model, unconstrained)
     adjoint, prepared = adjoint_of(problem), prepare_in_fit(model.scene, problem.settings, problem.skips)
@@ -124,26 +124,26 @@ def residuals(problem: Problem, unconstrained: Float[Array, "unknowns"], pieces:
 
     def share(shared: tuple[Problem, ExposedModel, Prepared, Scalar], rays: tuple[Array | None, Observations]) -> Array:
         problem, model, prepared, total = shared
-        stored, pieces = rays
+        stored, tiles = rays
 
-        def of_piece(piece: Observations) -> Array:
-            scale = jnp.sqrt(piece.weight / total)
-            return jnp.stack([scale * c for c in residual(problem.whole(stored), model, piece, prepared, adjoint)])
+        def of_tile(tile: Observations) -> Array:
+            scale = jnp.sqrt(tile.weight / total)
+            return jnp.stack([scale * c for c in residual(problem.reassembled(stored), model, tile, prepared, adjoint)])
 
-        return jax.lax.map(of_piece, pieces)
+        return jax.lax.map(of_tile, tiles)
 
-    return jnp.ravel(everywhere(over_rays(share, (shared, model, prepared, total), (stored, pieces))))
+    return jnp.ravel(everywhere(over_rays(share, (shared, model, prepared, total), (stored, tiles))))
 
 
 def residual(
-    problem: Problem, model: ExposedModel, piece: Observations, prepared: Prepared, adjoint: AbstractAdjoint = Replay()
+    problem: Problem, model: ExposedModel, tile: Observations, prepared: Prepared, adjoint: AbstractAdjoint = Replay()
 ) -> Triple:
     """Rendered minus target in each channel, differentiable in the mode of `adjoint`."""
-    medium, rays = observed_medium(model.scene, piece, problem.samples, problem.settings, prepared)
+    medium, rays = observed_medium(model.scene, tile, problem.samples, problem.settings, prepared)
     options = MarchOptions(problem.settings.termination, distance=False)
     gathered = adjoint.march(options, medium, rays, step_length(model.scene, problem.settings))
     colours = predict(problem, model, gathered, rays.length)
-    return tuple(c - piece.target[:, i] for i, c in enumerate(colours))
+    return tuple(c - tile.target[:, i] for i, c in enumerate(colours))
 
 
 @eqx.filter_jit
@@ -224,41 +224,41 @@ def _light_tangents(problem: Problem, values: Float[Array, "unknowns"]) -> Light
 
 
 def normal_equations(
-    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: LightTangents | None = None
+    problem: Problem, values: Float[Array, "unknowns"], tile: Observations, around: LightTangents | None = None
 ) -> Normal:
-    """The sums of `Normal` over one piece of rays, in float64; `around`: what `light_tangents` returns, else made for this piece alone.
+    """The sums of `Normal` over one tile of rays, in float64; `around`: what `light_tangents` returns, else made for this tile alone.
 
     The rows have the precision of `values`, their products are summed in float64. A matrix summed in float32 is uncertain by 1e-7, and
     already an eigenvalue of 1e-7 is a combination of unknowns that changes the images by 3e-4 of what a single one does.
     """
-    channels = _channels(problem, values, piece, around)
+    channels = _channels(problem, values, tile, around)
     with jax.enable_x64(True):
         return _sums(channels, values.size)
 
 
 @eqx.filter_jit
 def _channels(
-    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: LightTangents | None
+    problem: Problem, values: Float[Array, "unknowns"], tile: Observations, around: LightTangents | None
 ) -> list[_Channel]:
     shared, stored = problem.apart()
 
     def share(shared: tuple[Problem, Array, LightTangents | None], rays: tuple[Array | None, Observations]) -> list[_Channel]:
-        return _share_of_channels(shared[0].whole(rays[0]), shared[1], rays[1], shared[2])
+        return _share_of_channels(shared[0].reassembled(rays[0]), shared[1], rays[1], shared[2])
 
-    return over_rays(share, (shared, values, around), (stored, piece))
+    return over_rays(share, (shared, values, around), (stored, tile))
 
 
 def _share_of_channels(
-    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: LightTangents | None
+    problem: Problem, values: Float[Array, "unknowns"], tile: Observations, around: LightTangents | None
 ) -> list[_Channel]:
-    colours, blocks = _jacobian(problem, values, piece, around)
+    colours, blocks = _jacobian(problem, values, tile, around)
     channels = []
     for c, colour in enumerate(colours):
-        r = colour - piece.target[:, c]
+        r = colour - tile.target[:, c]
         rows = jnp.concatenate([block for block, _ in blocks[c]], axis=1)
         columns = tuple(np.concatenate([columns for _, columns in blocks[c]]).tolist())
-        losses = piece.weight * problem.loss.value(r)
-        channels.append(_Channel(r, piece.weight * problem.loss.weight(r), losses, rows, columns))
+        losses = tile.weight * problem.loss.value(r)
+        channels.append(_Channel(r, tile.weight * problem.loss.weight(r), losses, rows, columns))
     return channels
 
 
@@ -278,7 +278,7 @@ def _sums(channels: list[_Channel], n: int) -> Normal:
 
 
 def _jacobian(
-    problem: Problem, values: Float[Array, "unknowns"], piece: Observations, around: LightTangents | None
+    problem: Problem, values: Float[Array, "unknowns"], tile: Observations, around: LightTangents | None
 ) -> tuple[Triple, list[Blocks]]:
     """Predicted colours of a chunk, and for each channel blocks of its Jacobian with the unknowns that they belong to."""
     kinds = _Kinds.of(problem)
@@ -290,7 +290,7 @@ def _jacobian(
     def observed(scene: Scene, arrays: Any) -> tuple[Medium, Rays]:
         visible = None if around is None else eqx.combine(arrays, rest)
         prepared = prepare_in_fit(scene, problem.settings, problem.skips, visible)
-        return observed_medium(scene, piece, problem.samples, problem.settings, prepared)
+        return observed_medium(scene, tile, problem.samples, problem.settings, prepared)
 
     def of_inner(part: Array, arrays: Any) -> tuple[Triple, Marched]:
         changed = kinds.changed(part, values)

@@ -68,7 +68,7 @@ class Observations(eqx.Module):
         subsample = eqx.tree_at(lambda o: o.weight, subsample, subsample.weight.at[:, kept:].set(0))
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), subsample)
 
-    def pieces(self, chunk: int) -> list["Observations"]:
+    def tiles(self, chunk: int) -> list["Observations"]:
         """One chunk of every share at a time."""
         split = jax.tree.map(lambda x: x.reshape(shares(), -1, chunk, *x.shape[1:]), self)
         of_all = lambda i: jax.tree.map(lambda x: on_devices(x[:, i].reshape(-1, *x.shape[3:])), split)
@@ -172,15 +172,15 @@ def _rays(scene: Scene, camera: AbstractCamera) -> tuple[tuple[Triple, Triple], 
 
 
 @jax.jit
-def _inside(scene: Scene, piece: Observations) -> Rays:
+def _inside(scene: Scene, tile: Observations) -> Rays:
     """The rays inside of the volume, wherever that is in the world."""
     zero = jax.lax.stop_gradient(scene.volume.origin)
     (scene,) = near_volume(scene)
     origin = tuple(
         Exact(high, low).minus(Exact(zero.high[i], zero.low[i])).rounded()
-        for i, (high, low) in enumerate(zip(piece.origin, piece.low, strict=True))
+        for i, (high, low) in enumerate(zip(tile.origin, tile.low, strict=True))
     )
-    return enter(scene, origin, piece.direction, piece.behind)[0]
+    return enter(scene, origin, tile.direction, tile.behind)[0]
 
 
 def keep_samples(
@@ -191,8 +191,8 @@ def keep_samples(
     The error of a kept sample is at most 2^-17 of the range of the volume's values, of those between the ends of a table where these stay
     (`clamped`).
     """
-    pieces = observations.pieces(chunk)
-    counts = [int(_longest(scene, piece, settings)) for piece in pieces]
+    tiles = observations.tiles(chunk)
+    counts = [int(_longest(scene, tile, settings)) for tile in tiles]
     total = chunk * sum(counts)
     if 2 * total * shares() > limit or total >= 2**31:
         return None
@@ -200,9 +200,9 @@ def keep_samples(
     scale = jnp.where(high > low, (high - low) / (MISSING - 1), 1.0)
     stored = np.empty((shares(), total), np.uint16)
     starts, begin = [], 0
-    for piece, count in zip(pieces, counts, strict=True):
+    for tile, count in zip(tiles, counts, strict=True):
         for k in range(count):
-            found = _resample(scene, piece, settings, jnp.int32(k), low, scale)
+            found = _resample(scene, tile, settings, jnp.int32(k), low, scale)
             stored[:, begin + k * chunk : begin + (k + 1) * chunk] = found.reshape(shares(), chunk)
         starts.append(begin + np.arange(chunk, dtype=np.int32))
         begin += chunk * count
@@ -237,27 +237,27 @@ def is_mostly_empty(scene: Scene, settings: Settings) -> bool:
 
 
 def observed_medium(
-    scene: Scene, piece: Observations, samples: Samples | None, settings: Settings, prepared: Prepared
+    scene: Scene, tile: Observations, samples: Samples | None, settings: Settings, prepared: Prepared
 ) -> tuple[Medium, Rays]:
-    """What the rays of a piece march through, resampled anew or from kept samples, and the rays inside of it."""
-    rays = _inside(scene, piece)
+    """What the rays of a tile march through, resampled anew or from kept samples, and the rays inside of it."""
+    rays = _inside(scene, tile)
     through = medium(near_volume(scene)[0], settings, *prepared)
     if samples is not None:
-        through = through._replace(field=samples.along(piece.start))
+        through = through._replace(field=samples.along(tile.start))
     return through, rays
 
 
 @eqx.filter_jit
-def _longest(scene: Scene, piece: Observations, settings: Settings) -> Int[Array, ""]:
-    rays = _inside(scene, piece)
+def _longest(scene: Scene, tile: Observations, settings: Settings) -> Int[Array, ""]:
+    rays = _inside(scene, tile)
     return jnp.max(segment_count(rays.length, step_length(scene, settings)))
 
 
 @eqx.filter_jit
-def _resample(scene: Scene, piece: Observations, settings: Settings, k: Int[Array, ""], low: Array, scale: Array) -> Array:
-    def share(shared: tuple[Scene, Array, Array, Array], piece: Observations) -> Array:
+def _resample(scene: Scene, tile: Observations, settings: Settings, k: Int[Array, ""], low: Array, scale: Array) -> Array:
+    def share(shared: tuple[Scene, Array, Array, Array], tile: Observations) -> Array:
         scene, k, low, scale = shared
-        rays, dt = _inside(scene, piece), step_length(scene, settings)
+        rays, dt = _inside(scene, tile), step_length(scene, settings)
         _, u = segment(k, segment_count(rays.length, dt), rays.length, dt)
         found = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
         level = jnp.clip(jnp.round((found.s - low) / scale), 0, MISSING - 1)
@@ -265,7 +265,7 @@ def _resample(scene: Scene, piece: Observations, settings: Settings, k: Int[Arra
             level = jnp.where(known > 0.5, level, MISSING)
         return level.astype(jnp.uint16)
 
-    return everywhere(over_rays(share, (scene, k, low, scale), piece))
+    return everywhere(over_rays(share, (scene, k, low, scale), tile))
 
 
 def _check_weights(cameras: Sequence[AbstractCamera], weights: Sequence[Any] | None, dtype: Any) -> list[np.ndarray]:

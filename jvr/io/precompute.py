@@ -85,7 +85,7 @@ def precompute(
     if scene.radiance_transfer is None:
         return scene
     if scene.radiance_transfer.is_frozen:
-        if not scene.radiance_transfer.outdated(scene):
+        if not scene.radiance_transfer.stale(scene):
             return scene
         scene = eqx.tree_at(lambda s: s.radiance_transfer.projected, scene, None)
     transfer = transfer_of(scene)

@@ -141,7 +141,7 @@ def envelope(wanted: Float[Array, "bx by bz"], thickness: Triple, farthest: Scal
     between any two points of the bricks. With 0 and infinity in `wanted` this is a distance transform (chessboard metric).
     """
     finest = jnp.minimum(jnp.minimum(thickness[0], thickness[1]), thickness[2])
-    # Bricks on each side that a radius reaches; a rounding above a whole number is not one more.
+    # Bricks on each side that a radius reaches; a rounding above an integer is not one more.
     width = lambda radius: [jnp.ceil(radius / t - 1e-3) for t in thickness]
 
     def grow(state: tuple[Int[Array, ""], Array, Array]):

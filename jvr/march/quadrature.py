@@ -28,7 +28,7 @@ class PreIntegrated(AbstractQuadrature):
     between (`jvr.model.preintegration`): thin peaks are seen, at two resamplings a segment.
 
     **Arguments:** `parts`: how many parts of a segment its self-attenuation takes apart, order 4. Needs a `LinearTransfer` or a
-    `LutTransfer`. **Raises** `ValueError` where `parts` is not a positive whole number.
+    `LutTransfer`. **Raises** `ValueError` where `parts` is not a positive integer.
     """
 
     parts: int = eqx.field(static=True, default=1)

@@ -108,13 +108,13 @@ class AbstractRadianceTransfer(eqx.Module):
         """How far above a surface, in the world, it is known what arrives."""
 
     @abc.abstractmethod
-    def outdated(self, scene: Any) -> tuple[str, ...]:
-        """What has to be computed again for a scene of arrays at hand, in a sentence; empty where nothing has."""
+    def stale(self, scene: Any) -> tuple[str, ...]:
+        """What has to be computed again for a scene of concrete arrays, in a sentence; empty where nothing has."""
 
     @abc.abstractmethod
     def checked(self, scene: Any) -> "AbstractRadianceTransfer":
         """The same, for a scene that it has not been computed for an error: a `ValueError`, or, where that is traced, when the program
-        runs. Where it is `pinned` a warning, of arrays at hand."""
+        runs. Where it is `pinned` a warning, of concrete arrays."""
 
     @abc.abstractmethod
     def pinned(self) -> "AbstractRadianceTransfer":

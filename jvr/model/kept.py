@@ -39,7 +39,7 @@ _checksums: dict[int, tuple[weakref.ref, np.ndarray]] = {}
 
 
 def content(tree: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
-    """Checksums of the structure of a tree, with its static parts, and of each of its arrays. Arrays at hand are read once in their life,
+    """Checksums of the structure of a tree, with its static parts, and of each of its arrays. Concrete arrays are read once in their life,
     traced ones each time; no derivative goes through it."""
     arrays, structure = jax.tree.flatten(jax.lax.stop_gradient(tree))
     shapes = [(x.shape, str(x.dtype)) for x in arrays]

@@ -69,7 +69,7 @@ class PreIntegratedTable(AbstractTransfer):
     apart, a rule of order 4. Extinction, and emission without attenuation, are exact whatever `parts`.
 
     Memory: `n ceil(log2 n)` rows of 8 numbers, 10 for coloured extinction. Differentiable in every array of `table`.
-    **Raises** `TypeError` for another transfer function, `ValueError` where `parts` is not a positive whole number.
+    **Raises** `TypeError` for another transfer function, `ValueError` where `parts` is not a positive integer.
     """
 
     table: LinearTransfer | LutTransfer
@@ -84,7 +84,7 @@ class PreIntegratedTable(AbstractTransfer):
             raise ValueError(f"parts must be a positive whole number, not {parts}")
         self.table, self.parts = table, parts
         n = table.rgb.shape[0]
-        # An equally spaced table is measured in its own intervals: its entries sit at whole numbers, exactly.
+        # An equally spaced table is measured in its own intervals: its entries sit at integers, exactly.
         x = table.positions if isinstance(table, LinearTransfer) else jnp.arange(n, dtype=table.rgb.dtype)
         sigma_t = table.sigma_t.reshape(n, -1)
         # Both ends are repeated: outside of the table lies an interval of no width between equal entries.

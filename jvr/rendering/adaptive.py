@@ -32,7 +32,7 @@ FARTHEST = 32
 UNIFORM = "leave Settings(sampling=...) at jvr.Uniform()"
 
 
-# Compiled as one program also where it is called with arrays at hand; inside another program it is a part of that.
+# Compiled as one program also where it is called with concrete arrays; inside another program it is a part of that.
 @jax.jit
 def render_slices(
     scene: Scene, camera: AbstractCamera, settings: Settings, sampling: Slices, *, distances: DistanceField | None = None

@@ -231,7 +231,7 @@ def remarks_on(scene: Scene, shadow_stats: Any) -> Iterator[str]:
     if scene.environment is not None and not np.any(np.asarray(scene.environment.coefficients)):
         yield "environment has no strength: it is computed and adds nothing"
     if scene.radiance_transfer is not None:
-        yield from scene.radiance_transfer.outdated(scene)
+        yield from scene.radiance_transfer.stale(scene)
     if shadow_stats is not None and float(shadow_stats.overflow) > 0:
         share, error = float(shadow_stats.overflow), float(shadow_stats.error)
         yield f"{share:.0%} of the rays of a deep shadow map ran out of layers (error {error:.2g}): give it more"

@@ -19,7 +19,7 @@ class ImagePlane(NamedTuple):
     ahead: Scalar
 
     def rays(self, column: Float[Array, "points"], row: Float[Array, "points"]) -> tuple[Triple, Triple, Float[Array, "points"]]:
-        """Points on the plane, unit directions, and distances from the eye; whole numbers are pixel centres, as in
+        """Points on the plane, unit directions, and distances from the eye; integers are pixel centres, as in
         `AbstractCamera.rays_ahead` up to rounding."""
         at = lambda v: tuple(start + column * across + row * down for start, across, down in v)
         origin, direction = at(self.origin), at(self.direction)

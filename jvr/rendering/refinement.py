@@ -40,7 +40,7 @@ class _Picture(NamedTuple):
     traced: Bool[Array, "pixels"]
 
 
-# Compiled as one program also where it is called with arrays at hand; inside another program it is a part of that.
+# Compiled as one program also where it is called with concrete arrays; inside another program it is a part of that.
 @jax.jit
 def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sampling: Refinement) -> Rendering:
     """Renders `scene` as `camera` sees it, tracing the rays that `sampling` chooses and interpolating between them.
