@@ -270,7 +270,7 @@ def asked_for(unknowns, *sets):
 
 
 @pytest.mark.parametrize(
-    ("unknowns", "keep_material", "keep_unscattered", "keeps_transfer"),
+    ("unknowns", "keep_material", "keep_unscattered", "keeps_radiance_transfer"),
     [
         (["environment.coefficients"], False, False, False),
         (["material.reflectance"], True, False, False),
@@ -279,14 +279,14 @@ def asked_for(unknowns, *sets):
         (["volume.values", "material.reflectance"], True, False, True),
     ],
 )
-def test_a_fit_computes_beforehand_what_it_does_not_find(unknowns, keep_material, keep_unscattered, keeps_transfer):
+def test_a_fit_computes_beforehand_what_it_does_not_find(unknowns, keep_material, keep_unscattered, keeps_radiance_transfer):
     *asked, found = asked_for(unknowns)
     assert asked == [True, keep_material, keep_unscattered]
-    assert found.keeps_transfer == keeps_transfer
+    assert found.keeps_radiance_transfer == keeps_radiance_transfer
     # Told to follow, it leaves to each picture what the unknowns change, and that alone.
     *asked, found = asked_for(unknowns, "radiance_transfer.frozen=false")
-    assert asked == [not keeps_transfer, keep_material, keep_unscattered]
-    assert not found.keeps_transfer
+    assert asked == [not keeps_radiance_transfer, keep_material, keep_unscattered]
+    assert not found.keeps_radiance_transfer
     assert found.scene.radiance_transfer is not None
 
 
@@ -294,7 +294,7 @@ def test_a_fit_computes_beforehand_what_it_does_not_find(unknowns, keep_material
 def test_radiance_transfer_with_the_materials_colour_is_that_of_the_start():
     """Kept for an unknown material as it is, and not announced as that of another."""
     found = job(["material.reflectance"], "radiance_transfer={rays=4,resolution=0.1,bleeding='material'}")
-    assert found.keeps_transfer
+    assert found.keeps_radiance_transfer
     assert found.scene.radiance_transfer.is_frozen
     assert isinstance(found.scene.material, jvr.LambertBRDF)
     assert found.scene.radiance_transfer.stale(found.scene) == ()

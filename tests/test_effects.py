@@ -15,7 +15,7 @@ import jvr
 from jvr.rendering.advise import effects_of, remarks_on
 
 MODULES = ("lighting", "shading", "scattering", "shadow_rays", "shadow_volume", "shadow_map", "deep_shadow_map", "light_space")
-MODULES += ("environment_lighting", "radiance_transfer", "transfer_grid", "diffusion")
+MODULES += ("environment_lighting", "radiance_transfer", "radiance_transfer_grid", "diffusion")
 MODELS = ("material", "brdf", "microfacet", "merl", "dipole")
 LIGHT = {"lights": (jvr.DirectionalLight((0.3, -0.5, -1.0)), jvr.AmbientLight(0.2))}
 EFFECTS = {

@@ -15,7 +15,7 @@ from scenes import OBLIQUE, compiled, linear_transfer, perspective, rotation, vo
 import jvr
 from jvr.effects.diffusion import kernel_of, scatter
 from jvr.effects.environment_lighting import environment_lighting
-from jvr.effects.transfer_grid import TransferProjection, project_all
+from jvr.effects.radiance_transfer_grid import RadianceTransferProjection, project_all
 from jvr.model.harmonics.projection import sphere_nodes
 from jvr.rendering.medium import absorbing
 
@@ -41,9 +41,9 @@ def picture(scene, settings=SETTINGS):
 
 def transfer_at(scene):
     """Coefficients at the nodes of a scene, `(nodes, channels, bands)`, and `solid` and `facing` side by side."""
-    return compiled(lambda s: project_all(TransferProjection.of(s, absorbing(s, None, s.radiance_transfer.needs_gradient))))(
-        scene
-    )
+    return compiled(
+        lambda s: project_all(RadianceTransferProjection.of(s, absorbing(s, None, s.radiance_transfer.needs_gradient)))
+    )(scene)
 
 
 # --- light -----------------------------------------------------------------------------------------------------------
@@ -203,7 +203,7 @@ def test_above_an_opaque_half_space(material):
         material=material,
         radiance_transfer=jvr.RadianceTransfer(rays=1024, resolution=0.1),
     )
-    projection = TransferProjection.of(half_space, absorbing(half_space, None, False))
+    projection = RadianceTransferProjection.of(half_space, absorbing(half_space, None, False))
     c, around = compiled(lambda q, p: q.project(p))(projection, jnp.array([[20.0, 20.0, 10.2], [20.0, 20.0, 9.0]]))
     from jvr.model.harmonics.projection import cap
 

@@ -1,6 +1,7 @@
 """Radiance transfer: how much of the light from each direction reaches a point through the medium around it (Lindemann and Ropinski 2010,
-sections 4 and 4.1). Here is what of it a scene chooses; `jvr.effects.transfer_nodes` projects it on spherical harmonics at the nodes of a
-coarse grid, `jvr.effects.projected_transfer` is the result, and `jvr.effects.transfer_grid` interpolates it between nodes.
+sections 4 and 4.1). Here is what of it a scene chooses; `jvr.effects.radiance_transfer_nodes` projects it on spherical harmonics at the
+nodes of a coarse grid, `jvr.effects.projected_radiance_transfer` is the result, and `jvr.effects.radiance_transfer_grid` interpolates it
+between nodes.
 """
 
 import dataclasses
@@ -15,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, UInt32
 
-from jvr.effects.projected_transfer import ProjectedTransfer
+from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
 from jvr.model.dipole import Dipole
 from jvr.model.effects import AbstractRadianceTransfer
 from jvr.model.harmonics.basis import count
@@ -56,9 +57,9 @@ class RadianceTransfer(AbstractRadianceTransfer):
       white light behind it).
     - `scattering`: `jvr.Dipole(...)` or `None`: each node gets the mean of what its neighbours receive, weighted with the dipole's diffuse
       reflectance; `neighbourhood`: its radius, as a fraction of the volume's longest side.
-    - `exact`: the triple product of material, light and transfer at each sample. Without it, nodes know which fraction of the light arrives
-      of all that a diffuse surface reflects that faces where the medium there does (with a material without normal: of all light), and the
-      sample multiplies that with its own product of material and light. Both are the same where nothing else is in the way.
+    - `exact`: the triple product of material, light and radiance transfer at each sample. Without it, nodes know which fraction of the
+      light arrives of all that a diffuse surface reflects that faces where the medium there does (with a material without normal: of all
+      light), and the sample multiplies that with its own product of material and light. Both are the same where nothing else is in the way.
     - `chromaticity`: `None`, or the order to keep colour differences at, where rays carry colour; luminance keeps `order`.
     - `step`, `growth`: first step in voxels, and the ratio of a step to the one before; `termination`: a ray ends once its transmittance
       is at most this.
@@ -83,7 +84,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
     termination: float = eqx.field(static=True)
     surface: float = eqx.field(static=True)
     memory: float = eqx.field(static=True)
-    projected: ProjectedTransfer | None
+    projected: ProjectedRadianceTransfer | None
 
     def __init__(
         self,
@@ -169,7 +170,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
             else (_changed(self, resolution=self.resolution / 2), _changed(self, rays=max(self.rays // 2, 1)))
         )
 
-    def with_projected(self, projected: ProjectedTransfer) -> "RadianceTransfer":
+    def with_projected(self, projected: ProjectedRadianceTransfer) -> "RadianceTransfer":
         """The same, computed beforehand."""
         return eqx.tree_at(lambda t: t.projected, self, projected, is_leaf=lambda x: x is None)
 

@@ -109,10 +109,10 @@ def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility 
         shadows = scene.shadows.visibility(scene, delta_lights(scene), medium, jnp.min(scene.volume.spacing))
     if scene.radiance_transfer is None:
         return shadows
-    from jvr.effects.transfer_grid import transfer_visibility
+    from jvr.effects.radiance_transfer_grid import radiance_transfer_visibility
 
     medium = absorbing(scene, occupancy, scene.transfer.takes_gradient or scene.radiance_transfer.needs_gradient)
-    return transfer_visibility(scene, medium, shadows, len(delta_lights(scene)))
+    return radiance_transfer_visibility(scene, medium, shadows, len(delta_lights(scene)))
 
 
 def absorbing(scene: Scene, occupancy: Occupancy | None, graded: bool) -> Medium:

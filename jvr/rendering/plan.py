@@ -132,18 +132,29 @@ def _light_parts(scene: Scene) -> tuple[Part, ...]:
 
 def _environment_parts(scene: Scene) -> tuple[Part, ...]:
     """Environment lighting, the material that shows it, and what is in its way."""
-    environment, material, transfer, none = scene.environment, scene.material, scene.radiance_transfer, "the scene names none"
+    environment, material, radiance_transfer, none = (
+        scene.environment,
+        scene.material,
+        scene.radiance_transfer,
+        "the scene names none",
+    )
     around = none if environment is None else f"environment lighting, {len(environment.coefficients)} coefficients"
     needs = ("environment", "gradient") if material is not None and material.needs_gradient else ("environment",)
     shown = none if material is None else describe(material)
-    made = "" if transfer is None else "computed beforehand" if transfer.is_frozen else "computed in each picture: jvr.precompute"
+    made = (
+        ""
+        if radiance_transfer is None
+        else "computed beforehand"
+        if radiance_transfer.is_frozen
+        else "computed in each picture: jvr.precompute"
+    )
     return (
         Part("environment", environment is not None, around),
         Part("material", material is not None, shown, needs if material is not None else ()),
         Part(
             "radiance transfer",
-            transfer is not None,
-            f"{describe(transfer)}, {made}" if transfer is not None else none,
-            ("environment", "light march") if transfer is not None else (),
+            radiance_transfer is not None,
+            f"{describe(radiance_transfer)}, {made}" if radiance_transfer is not None else none,
+            ("environment", "light march") if radiance_transfer is not None else (),
         ),
     )

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jvr.io.config.cameras import cameras_of
-from jvr.io.config.environment import Precompute, environment_parts, fit_scene, keeps_transfer, precomputed
+from jvr.io.config.environment import Precompute, environment_parts, fit_scene, keeps_radiance_transfer, precomputed
 from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.light import graded, light_parts
 from jvr.io.config.load import Config, started
@@ -46,7 +46,7 @@ class FitJob(NamedTuple):
     - `truth`: the transfer function that rendered the targets, `None` where they are files.
     - `held_out`: cameras and images that take no part, `None` without any.
     - `keywords`: of `jvr.fit`: unknowns, solver, loss, priors and so on.
-    - `keeps_transfer`: whether the radiance transfer stays that of the start though the unknowns change it.
+    - `keeps_radiance_transfer`: whether the radiance transfer stays that of the start though the unknowns change it.
     """
 
     scene: Scene
@@ -55,7 +55,7 @@ class FitJob(NamedTuple):
     truth: AbstractTransfer | None
     held_out: tuple[tuple[AbstractCamera, ...], tuple[np.ndarray, ...]] | None
     keywords: dict[str, Any]
-    keeps_transfer: bool = False
+    keeps_radiance_transfer: bool = False
 
 
 def build_settings(config: Config) -> Settings:
@@ -143,14 +143,14 @@ def build_fit(
     if tables.truth is None:
         images = _images(config, fit, cameras, read_image)
         (inside, targets), held_out = _held_out_images(config, fit, cameras, images)
-        return FitJob(scene, inside, targets, None, held_out, keywords, keeps_transfer(config))
+        return FitJob(scene, inside, targets, None, held_out, keywords, keeps_radiance_transfer(config))
     truth = _transfer(config, tables.truth, volume, "truth")
     true_scene = precompute(_scene(config, volume, truth))
     picture = lambda camera: np.asarray(render(true_scene, camera, settings).rgb)
     extra = _extra_cameras(config, fit, cameras, volume)
     inside, outside = ([c for c, out in extra if out == which] for which in (False, True))
     held_out = (tuple(outside), tuple(map(picture, outside))) if outside else None
-    return FitJob(scene, tuple(inside), tuple(map(picture, inside)), truth, held_out, keywords, keeps_transfer(config))
+    return FitJob(scene, tuple(inside), tuple(map(picture, inside)), truth, held_out, keywords, keeps_radiance_transfer(config))
 
 
 def _sampling(table: AnySampling) -> AbstractSampling:

@@ -53,13 +53,13 @@ def precomputed(scene: Scene, **keywords: Any) -> Scene:
     return precompute(scene, **keywords)
 
 
-def keeps_transfer(config: Config) -> bool:
+def keeps_radiance_transfer(config: Config) -> bool:
     """Whether a fit keeps the radiance transfer of its start though its unknowns change it."""
     table = config.tables.radiance_transfer
-    return table is not None and table.frozen and _fits(config, *_shapes_transfer(table))
+    return table is not None and table.frozen and _fits(config, *_shapes_radiance_transfer(table))
 
 
-def _shapes_transfer(table: RadianceTransferTable) -> tuple[str, ...]:
+def _shapes_radiance_transfer(table: RadianceTransferTable) -> tuple[str, ...]:
     """Parts of the scene that radiance transfer is computed from."""
     return ("transfer", "volume", "clipping", *(["material"] if table.bleeding == "material" else []))
 
@@ -68,7 +68,7 @@ def fit_scene(config: Config, scene: Scene, precompute: Precompute) -> Scene:
     """The scene that a fit starts from, with all computed beforehand that the fit does not change, or keeps as it is at its start."""
     keep = {"keep_material": _fits(config, "material"), "keep_unscattered": _fits(config, "radiance_transfer")}
     transfer, table = scene.radiance_transfer, config.tables.radiance_transfer
-    if table is None or table.frozen or not _fits(config, *_shapes_transfer(table)):
+    if table is None or table.frozen or not _fits(config, *_shapes_radiance_transfer(table)):
         return precompute(scene, **keep)
     return dataclasses.replace(precompute(dataclasses.replace(scene, radiance_transfer=None), **keep), radiance_transfer=transfer)
 

@@ -13,10 +13,10 @@ from jvr.model.harmonics.basis import count
 from jvr.model.transfer import AbstractTransfer
 
 
-class ProjectedTransfer(eqx.Module):
+class ProjectedRadianceTransfer(eqx.Module):
     """Radiance transfer as it was projected, for the transfer function of that time.
 
-    - `luminance`: `(x, y, z, 1, bands)` for a transfer without colour, else `(x, y, z, 3, bands)`, or the luma alone where
+    - `luminance`: `(x, y, z, 1, bands)` for a radiance transfer without colour, else `(x, y, z, 3, bands)`, or the luma alone where
     - `chroma`: `(x, y, z, 2, fewer bands)` holds orange-blue and green-purple differences (YCoCg); else `None`.
     - `solid`: `(x, y, z)`, how much of an opaque surface there is, from above 0 to 1; 0 where nothing is near and nothing was projected.
     - `facing`: `(x, y, z, 3)`, the unit vector away from the medium, shorter where that has hardly a direction.
@@ -59,7 +59,7 @@ class ProjectedTransfer(eqx.Module):
             return jnp.all(now == then)
         return bool(np.all(np.asarray(now) == np.asarray(then)))
 
-    def separated(self, order: int) -> "ProjectedTransfer":
+    def separated(self, order: int) -> "ProjectedRadianceTransfer":
         """The same as luma, and colour differences up to an order (YCoCg, whose inverse is exact)."""
         red, green, blue = jnp.moveaxis(self.coefficients, 3, 0)
         luma = 0.25 * (red + blue) + 0.5 * green
