@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from scipy.special import expn
 
 import jvr
-from jvr.effects.own_shadow import OwnShadow, Segment
+from jvr.effects.own_shadow import OwnShadow, ShadedSegment
 from jvr.model.transfer import Classified
 
 TILT = rotation(0.25, 0.1, 0.35)
@@ -139,7 +139,7 @@ def test_the_shadow_that_a_surface_casts_on_itself(tau, strength):
     shadow = OwnShadow(linear, jnp.asarray(3.0), of_opacity=False, bleeds=False)
     up, s = tuple(map(jnp.asarray, (0.0, 0.0, 1.0))), jnp.asarray(1.0)
     slope = tuple(map(jnp.asarray, (0.0, 0.0, -1 / 3)))
-    here = Segment(Classified((s, s, s), (jnp.asarray(tau / 1.5),)), slope, jnp.asarray(0.0))
+    here = ShadedSegment(Classified((s, s, s), (jnp.asarray(tau / 1.5),)), slope, jnp.asarray(0.0))
     found = [band[0] for band in shadow.remaining(s, jnp.asarray(1 / 3), up, up, here, jnp.asarray(strength))]
     e = {n: expn(n, tau * (1.0 if strength == 1 else 0.75)) for n in (3, 4, 5)}
     # The rule of four places is a few percent of the depth off.
@@ -152,7 +152,7 @@ def test_a_shadow_of_what_is_densest_is_dark():
     def kept(sigma):
         shadow = OwnShadow(jvr.LinearTransfer([0.0, 1.0], [[1, 1, 1]] * 2, [sigma, sigma]), jnp.asarray(3.0), False, False)
         up, s = tuple(map(jnp.asarray, (0.0, 0.0, 1.0))), jnp.asarray(1.0)
-        here = Segment(Classified((s, s, s), (sigma,)), up, jnp.asarray(1.0))
+        here = ShadedSegment(Classified((s, s, s), (sigma,)), up, jnp.asarray(1.0))
         return shadow.remaining(s, s, up, up, here, s)[0][0]
 
     value, slope = jax.value_and_grad(kept)(jnp.asarray(1e25))

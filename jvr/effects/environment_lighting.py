@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.effects.own_shadow import OwnShadow, Segment, own_shadow_of
+from jvr.effects.own_shadow import OwnShadow, ShadedSegment, own_shadow_of
 from jvr.effects.shading import surface_weight
 from jvr.model.harmonics.basis import band_of, basis, count
 from jvr.model.material import HarmonicMaterial, Lobe, SymmetryAxis
@@ -96,7 +96,7 @@ class EnvironmentLighting(eqx.Module):
         w_o: Triple,
         incident: Channels,
         cut: Scalar | float = 0.0,
-        here: Segment | None = None,
+        here: ShadedSegment | None = None,
     ) -> tuple[Triple, Triple]:
         """What the colour of the medium is multiplied with, and what is added to that in the light's own colour.
 

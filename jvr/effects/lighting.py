@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from jvr.effects.cut import CutFaces
-from jvr.effects.own_shadow import Segment
+from jvr.effects.own_shadow import ShadedSegment
 from jvr.effects.shading import surface_weight
 from jvr.march.shaders import OpticalShader, PreIntegratedShader, where_known
 from jvr.march.steps import Point, Sample
@@ -37,12 +37,12 @@ class LitShader(OpticalShader):
     cut: CutFaces | None = None  # where surfaces are clipped
     environment: Any = None  # a `jvr.effects.environment_lighting.EnvironmentLighting`, where the scene has an environment
 
-    def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        factor, added = self.light_at(sample, point, medium, dt)
-        rgb = tuple(c * a + b for c, a, b in zip(medium.rgb, factor, added, strict=True))
-        return self.optical.segment(Classified(rgb, medium.sigma_t), dt)
+    def shade(self, classified: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        factor, added = self.light_at(sample, point, classified, dt)
+        rgb = tuple(c * a + b for c, a, b in zip(classified.rgb, factor, added, strict=True))
+        return self.optical.evaluate_segment(Classified(rgb, classified.sigma_t), dt)
 
-    def light_at(self, sample: Sample, point: Point, medium: Classified, dt: Scalar) -> tuple[Triple, Triple]:
+    def light_at(self, sample: Sample, point: Point, classified: Classified, dt: Scalar) -> tuple[Triple, Triple]:
         """`a` and `b` of a sample that stands for a segment of length `dt` of a medium."""
         zero = jnp.zeros_like(sample.s)
         x = transformed(self.world_from_grid, point.p)
@@ -86,7 +86,7 @@ class LitShader(OpticalShader):
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
         if self.environment is not None:
             around = transmittances[len(self.lights)] if len(transmittances) > len(self.lights) else ()
-            here = Segment(medium, sample.gradient, dt)
+            here = ShadedSegment(classified, sample.gradient, dt)
             tinted, unmodulated = self.environment.reflect(sample.s, magnitude, normal, w_o, around, cut, here)
             factor = [f + reflects * c for f, c in zip(factor, tinted, strict=True)]
             added = [b + reflects * c for b, c in zip(added, unmodulated, strict=True)]
@@ -98,11 +98,11 @@ class LitPreIntegratedShader(LitShader, PreIntegratedShader):
 
     def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
-        emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
+        emitted, dtau = transfer.evaluate_segment(self.optical, front.s, back.s, dt)
         middle = self.in_world(transfer.table, _mean(front, back), point)
         factor, added = self.light_at(middle, point, transfer.evaluate(middle.s), dt)
         # A constant colour of the given optical depth.
-        extra, _ = self.optical.segment(Classified(added, dtau), jnp.ones_like(dt))
+        extra, _ = self.optical.evaluate_segment(Classified(added, dtau), jnp.ones_like(dt))
         radiance = tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False))
         return where_known(samples, radiance), where_known(samples, dtau)
 

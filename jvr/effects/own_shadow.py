@@ -28,10 +28,10 @@ _STEPS = (np.arange(4) + 0.5) / 4
 NODES, WEIGHTS = _STEPS**2.5, _STEPS**1.5 / np.sum(_STEPS**1.5)
 
 
-class Segment(NamedTuple):
+class ShadedSegment(NamedTuple):
     """A segment whose light is asked for: the properties and the gradient at its middle, and its length."""
 
-    medium: Classified
+    classified: Classified
     gradient: Triple
     dt: Scalar
 
@@ -50,14 +50,14 @@ class OwnShadow(eqx.Module):
     bleeds: bool = eqx.field(static=True)
     albedo: Any = None
 
-    def remaining(self, s: Scalar, magnitude: Scalar, normal: Triple, w_o: Triple, here: Segment, strength: Scalar) -> Any:
+    def remaining(self, s: Scalar, magnitude: Scalar, normal: Triple, w_o: Triple, here: ShadedSegment, strength: Scalar) -> Any:
         """What band `l` keeps, `[l][channel]` for `l` up to 2, with one or three channels; `strength`: how much of a surface there is."""
         # Rays of nodes begin as much lower as there is less of a surface: what is above them is in what they carry.
         tau = self._depth(s, magnitude, normal, w_o, here, strength * self.width)
         e3, e4, e5 = (_exponential_integral(n, tau) for n in (3, 4, 5))
         shadows = [1 - f for f in (2 * e3, 3 * e4, 4 * (3 * e5 - e3))]
         if self.bleeds:
-            colour = here.medium.rgb
+            colour = here.classified.rgb
             if self.albedo is not None:
                 # The medium above is seen from below, along its normal.
                 tinted, unmodulated = self.albedo.reflect(s, magnitude, normal, normal, ())
@@ -65,9 +65,9 @@ class OwnShadow(eqx.Module):
             return [tuple(1 - shadow * (1 - c) for c in colour) for shadow in shadows]
         return [(1 - shadow,) for shadow in shadows]
 
-    def _depth(self, s: Scalar, magnitude: Scalar, normal: Triple, w_o: Triple, here: Segment, width: Scalar) -> Scalar:
+    def _depth(self, s: Scalar, magnitude: Scalar, normal: Triple, w_o: Triple, here: ShadedSegment, width: Scalar) -> Scalar:
         """Optical depth of the medium up to `width` in front of the place where the light of a segment is looked at."""
-        sigma = _mean(here.medium.sigma_t)
+        sigma = _mean(here.classified.sigma_t)
         # As far in front of the middle as the light that arrives is looked up: `jvr.march.segments.light_at`.
         ahead = here.dt * (0.5 - mean_depth(jnp.minimum(sigma * here.dt, DENSEST)))
         begin, slope = ahead * dot(here.gradient, w_o), dot(here.gradient, normal)

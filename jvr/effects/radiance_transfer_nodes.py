@@ -178,10 +178,10 @@ def _carried(
         # By a rounding the middle may be outside, where nothing may be read.
         at = tuple(rounded_into(c + middle * d, a, b) for c, d, a, b in zip(rays.p, rays.along, lower, upper, strict=True))
         inside = (end > begin) & (_least(tau) < opaque)
-        medium_there, sample = classify_at(medium, _points(at, rays.along), inside)
-        dtau = tuple(jnp.where(inside, sigma * (end - begin), 0.0) for sigma in medium_there.sigma_t)
+        classified, sample = classify_at(medium, _points(at, rays.along), inside)
+        dtau = tuple(jnp.where(inside, sigma * (end - begin), 0.0) for sigma in classified.sigma_t)
         if colour:
-            rgb = _colour(medium_there.rgb, sample, albedo, toward_origin)
+            rgb = _colour(classified.rgb, sample, albedo, toward_origin)
             before = [jnp.exp(-t) for t in tau] * (3 // len(tau))
             thick = dtau * (3 // len(dtau))
             colour = tuple(c - T * jnp.expm1(-d) * e for c, T, d, e in zip(colour, before, thick, rgb, strict=True))

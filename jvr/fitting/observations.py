@@ -14,7 +14,7 @@ from jvr.execution.devices import everywhere, on_devices, over_rays, shares
 from jvr.march.fields import MISSING, CachedSamples, VoxelField
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
-from jvr.march.steps import Rays, points_at, segment, segment_count
+from jvr.march.steps import Rays, points_at, segment_count, segment_span
 from jvr.model.camera import AbstractCamera
 from jvr.model.exact import Exact
 from jvr.model.scene import Scene
@@ -258,7 +258,7 @@ def _resample(scene: Scene, tile: Observations, settings: Settings, k: Int[Array
     def share(shared: tuple[Scene, Array, Array, Array], tile: Observations) -> Array:
         scene, k, low, scale = shared
         rays, dt = _inside(scene, tile), step_length(scene, settings)
-        _, u = segment(k, segment_count(rays.length, dt), rays.length, dt)
+        _, u = segment_span(k, segment_count(rays.length, dt), rays.length, dt)
         found = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
         level = jnp.clip(jnp.round((found.s - low) / scale), 0, MISSING - 1)
         for known in found.known:

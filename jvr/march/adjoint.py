@@ -26,7 +26,7 @@ from jvr.march.march import Marched, MarchOptions, ReplayRecord, integrate, marc
 from jvr.march.medium import Medium, for_derivatives
 from jvr.march.rules import is_zero, wanted_and_fixed, with_zeros
 from jvr.march.segments import ActiveRays, SegmentBatch, active_rays, node_points, occupied_count, resample, with_lighting
-from jvr.march.steps import Rays, Sample, points_at, segment
+from jvr.march.steps import Rays, Sample, points_at, segment_span
 from jvr.march.sums import opacity, through, transmittance
 from jvr.march.wavefront import wavefront_while
 from jvr.numerics import materialise, one_minus_exp, two_sum
@@ -86,7 +86,7 @@ class BackwardRays(NamedTuple):
         if medium.occupancy is None:
             return j
         rays = self.active.rays
-        extent, u = segment(jnp.maximum(self.steps - 1 - j, 0), self.active.segments, rays.length, dt)
+        extent, u = segment_span(jnp.maximum(self.steps - 1 - j, 0), self.active.segments, rays.length, dt)
         within = len(medium.shader.quadrature_nodes) > 1
         first = u + extent / 2 if within else u
         return jnp.minimum(j + medium.occupancy.skip(rays, first, dt, backwards=True, within=within), self.steps)
@@ -186,7 +186,7 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangent: M
     def local(small: Any, taps: tuple[Sample, ...]):
         """The segment as a function of what its derivative is wanted for; the taps stand for the field."""
         transfer, shader, shadows, rays, dt = eqx.combine(small, rest)
-        extent, u = segment(k, count, rays.length, dt)
+        extent, u = segment_span(k, count, rays.length, dt)
         sampled = node_points(medium, rays, active.ray, k, u, extent)
         samples = jax.tree.map(jnp.add, resample(medium, sampled, k < count), taps)
         batch = SegmentBatch(rays, active.ray, k, u, extent, k < count)

@@ -47,7 +47,7 @@ class CachedSamples(AbstractField):
 
     def resample(self, point: Point) -> Sample:
         # Clipped: the index of a finished ray may lie beyond the end.
-        index = self.start[point.ray] + point.segment * self.stride
+        index = self.start[point.ray] + point.k * self.stride
         stored = self.stored.at[index].get(mode="clip")
         known = ((stored != MISSING).astype(self.low.dtype),) if self.gaps else ()
         return Sample(self.low + self.scale * stored.astype(self.low.dtype), known=known)

@@ -58,14 +58,14 @@ class AbstractShader(eqx.Module):
     quadrature_nodes: ClassVar[tuple[float, ...]] = (0.0,)
 
     @abc.abstractmethod
-    def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+    def shade(self, classified: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         """Emitted radiance (three components or none) and optical depth (one, three or none) of one segment of length `dt` whose
         properties are constant."""
 
     def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         """The same for a segment around `point`, from what is known at `quadrature_nodes`."""
         sample = self.in_world(transfer, samples[0], point)
-        return self.segment(self.classify(transfer, sample), sample, point, dt)
+        return self.shade(self.classify(transfer, sample), sample, point, dt)
 
     def in_world(self, transfer: Any, sample: Sample, point: Point) -> Sample:
         """The sample with its gradient in the world."""

@@ -173,7 +173,7 @@ class Features(NamedTuple):
 def features_of(volume: Volume, table: LinearTransfer | LutTransfer, optical: AbstractOpticalModel) -> Features:
     """The features of the medium that an oracle looks at."""
     classified = jax.vmap(table.evaluate)(table.positions)
-    emitted, dtau = optical.segment(classified, jnp.min(volume.spacing))
+    emitted, dtau = optical.evaluate_segment(classified, jnp.min(volume.spacing))
     return Features(table, table.positions, jnp.stack([*emitted, *map(one_minus_exp, dtau)]))
 
 

@@ -22,7 +22,7 @@ from jvr.march.march import Marched, MarchOptions, integrate
 from jvr.march.medium import Medium, for_derivatives
 from jvr.march.segments import SegmentBatch, active_rays, light_at, occupied_count
 from jvr.march.shaders import where_known
-from jvr.march.steps import Rays, points_at, segment
+from jvr.march.steps import Rays, points_at, segment_span
 from jvr.march.sums import transmittance
 from jvr.march.wavefront import wavefront_while
 from jvr.model.transfer import AbstractTable, Classified
@@ -96,7 +96,7 @@ def _row_segment(
     j = back.skip(medium, dt, j)
     active, (k, count) = back.active, back.at(j)
     count = occupied_count(medium, active, dt, k, count)
-    extent, distance = segment(k, count, active.rays.length, dt)
+    extent, distance = segment_span(k, count, active.rays.length, dt)
     points = points_at(active.rays, active.ray, k, distance)
     samples = jax.vmap(medium.field.resample)(points)
     samples = jax.vmap(medium.shader.in_world, in_axes=(None, 0, 0))(medium.transfer, samples, points)
@@ -106,7 +106,7 @@ def _row_segment(
     def radiance_and_depth(classified: Classified) -> tuple[Channels, Channels]:
         # Where in the segment the light is looked up depends on its extinction; the light itself does not.
         light = {} if medium.shadows is None else {"light": light_at(medium, batch, classified.sigma_t, reverse=True)}
-        return jax.vmap(medium.shader.segment)(classified, samples._replace(**light), points, extent)
+        return jax.vmap(medium.shader.shade)(classified, samples._replace(**light), points, extent)
 
     (emitted, dtau), pull = jax.vjp(radiance_and_depth, classified)
     front = back.depth(j, suffix, dtau)

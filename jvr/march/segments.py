@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.march.medium import DENSEST, Medium
-from jvr.march.steps import Point, Rays, Sample, points_at, segment, segment_count
+from jvr.march.steps import Point, Rays, Sample, points_at, segment_count, segment_span
 from jvr.model.transfer import Classified
 from jvr.numerics import materialise, mean_depth
 from jvr.types import Channels, Scalar
@@ -47,7 +47,7 @@ def skip(medium: Medium, active: ActiveRays, dt: Scalar, k: Int[Array, "rays"]) 
     """The next segment, from `k` on, that may have a sample in a visible brick, or the number of segments."""
     if medium.occupancy is None:
         return k
-    extent, u = segment(k, active.segments, active.rays.length, dt)
+    extent, u = segment_span(k, active.segments, active.rays.length, dt)
     within = len(medium.shader.quadrature_nodes) > 1
     first = u - extent / 2 if within else u
     return jnp.minimum(k + medium.occupancy.skip(active.rays, first, dt, within=within), active.segments)
@@ -69,13 +69,13 @@ def occupied_count(
     empty means negligible, both directions have to take the same segments."""
     if medium.occupancy is None or not medium.occupancy.is_bounded:
         return count
-    _, u = segment(k, count, active.rays.length, dt)
+    _, u = segment_span(k, count, active.rays.length, dt)
     return jnp.where(medium.occupancy.is_occupied(active.rays, u), count, 0)
 
 
 def take_segment(medium: Medium, active: ActiveRays, dt: Scalar, k: Int[Array, "rays"], count: Int[Array, "rays"]):
     """Emission and optical depth of segment `k` of every ray, and the distance of its midpoint; zero beyond `count`."""
-    extent, u = segment(k, count, active.rays.length, dt)
+    extent, u = segment_span(k, count, active.rays.length, dt)
     sampled = node_points(medium, active.rays, active.ray, k, u, extent)
     batch = SegmentBatch(active.rays, active.ray, k, u, extent, k < count)
     samples = with_lighting(medium, batch, resample(medium, sampled, k < count), reverse=False)

@@ -58,8 +58,8 @@ class OpticalShader(AbstractShader):
     optical: AbstractOpticalModel
     frame: GradientFrame | None
 
-    def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        return self.optical.segment(medium, dt)
+    def shade(self, classified: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        return self.optical.evaluate_segment(classified, dt)
 
     def in_world(self, transfer: Any, sample: Sample, point: Point) -> Sample:
         return sample if self.frame is None else self.frame.in_world(transfer, sample, point)
@@ -89,5 +89,5 @@ class PreIntegratedShader(OpticalShader):
 
     def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
-        emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
+        emitted, dtau = transfer.evaluate_segment(self.optical, front.s, back.s, dt)
         return where_known(samples, emitted), where_known(samples, dtau)

@@ -29,12 +29,12 @@ class Rays(NamedTuple):
 
 class Point(NamedTuple):
     """One sample on one ray: its grid position, the ray's direction (grid coordinates per world length), the ray's index in the batch
-    and the index of its segment."""
+    and `k`, the index of its segment."""
 
     p: Triple
     direction: Triple
     ray: Int[Array, ""]
-    segment: Int[Array, ""]
+    k: Int[Array, ""]
 
 
 class Sample(NamedTuple):
@@ -57,7 +57,7 @@ def segment_count(length: Float[Array, "rays"], dt: Scalar) -> Int[Array, "rays"
     return jnp.ceil(jax.lax.stop_gradient(length / dt)).astype(jnp.int32)
 
 
-def segment(k: Int[Array, "..."], count: Int[Array, "rays"], length: Float[Array, "rays"], dt: Scalar):
+def segment_span(k: Int[Array, "..."], count: Int[Array, "rays"], length: Float[Array, "rays"], dt: Scalar):
     """Length of segment `k` of each ray, and the distance of its midpoint from the entry.
 
     Only the last segment's length depends on where the ray leaves. Past it the length is zero and the point stays at the exit,

@@ -125,7 +125,7 @@ class AbstractRadianceTransfer(eqx.Module):
         return ()
 
 
-def describe(part: Any) -> str:
+def spelling(part: Any) -> str:
     """A part of a scene with its static choices, such as `ShadowRays(step=1, termination=0.001)`; nothing for `None`."""
     if part is None:
         return ""

@@ -51,8 +51,8 @@ class SegmentMeans(NamedTuple):
     lag: Triple
 
     def emit(self, optical: AbstractOpticalModel, dt: Scalar) -> tuple[Channels, Channels]:
-        """Radiance that leaves the segment of length `dt` and its optical depth, in the channels of `optical.segment`."""
-        emitted, dtau = optical.segment(Classified(self.rgb, self.sigma_t), dt)
+        """Radiance that leaves the segment of length `dt` and its optical depth, in the channels of `optical.evaluate_segment`."""
+        emitted, dtau = optical.evaluate_segment(Classified(self.rgb, self.sigma_t), dt)
         if not emitted:
             return emitted, dtau
         if not dtau:
@@ -97,9 +97,9 @@ class PreIntegratedTable(AbstractTransfer):
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
         return self.table.is_visible(low, high, least, nearby=nearby)
 
-    def segment(self, optical: AbstractOpticalModel, s0: Scalar, s1: Scalar, dt: Scalar) -> tuple[Channels, Channels]:
+    def evaluate_segment(self, optical: AbstractOpticalModel, s0: Scalar, s1: Scalar, dt: Scalar) -> tuple[Channels, Channels]:
         """Radiance that leaves a segment of length `dt` along which the scalar goes linearly from `s0` to `s1`, and its optical
-        depth, in the channels of `optical.segment`.
+        depth, in the channels of `optical.evaluate_segment`.
 
         Differentiable in everything. Where an end lies at an entry the derivative in the scalar is that of one side. The place of an
         entry between those of a `LutTransfer`'s domain is known to rounding: so is which side a scalar nearer than that lies on.

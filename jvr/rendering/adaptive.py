@@ -59,7 +59,7 @@ def render_slices(
     plane, dt = image_plane(camera, ahead(scene, camera)), step_length(scene, settings)
     period = 2**sampling.levels
     width, height = (-(-n // period) * period for n in (camera.width, camera.height))
-    options = SliceOptions(sampling.levels, width, height, settings.termination, _segment)
+    options = SliceOptions(sampling.levels, width, height, settings.termination, _evaluate_segments)
     lattice, finest, t_in = _lattice(scene, camera, plane, options, dt)
     if distances is None:
         farthest = _farthest(scene, sampling, options, lattice, dt)
@@ -98,10 +98,10 @@ def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
     return scene.transfer
 
 
-def _segment(shading: Any, segments: tuple[Array, Array, Array]) -> tuple[Channels, Channels]:
+def _evaluate_segments(shading: Any, segments: tuple[Array, Array, Array]) -> tuple[Channels, Channels]:
     """Radiance and optical depth of segments along which the scalar changes linearly."""
     table, optical = shading
-    return jax.vmap(lambda front, back, length: table.segment(optical, front, back, length))(*segments)
+    return jax.vmap(lambda front, back, length: table.evaluate_segment(optical, front, back, length))(*segments)
 
 
 def _farthest(scene: Scene, sampling: Slices, options: SliceOptions, lattice: Lattice, dt: Scalar) -> Scalar:

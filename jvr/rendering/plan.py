@@ -6,7 +6,7 @@ import jax
 
 from jvr.execution.devices import cores, shares
 from jvr.march.quadrature import PreIntegrated
-from jvr.model.effects import describe
+from jvr.model.effects import spelling
 from jvr.model.light import AmbientLight
 from jvr.model.optical import EmissionOnly
 from jvr.model.scene import Scene
@@ -111,18 +111,18 @@ def _light_parts(scene: Scene) -> tuple[Part, ...]:
         "transfer": scene.transfer.takes_gradient,
     }
     asking = " and ".join(name for name, there in asks.items() if there)
-    gradient = f"{describe(scene.normals)}, asked for by {asking}" if asking else "nothing asks for a gradient"
+    gradient = f"{spelling(scene.normals)}, asked for by {asking}" if asking else "nothing asks for a gradient"
     casting = sum(light.casts_shadows for light in delta_lights(scene))
-    shaded = none if shadows is None else f"{describe(shadows)} for {casting} light{'s' * (casting != 1)}"
+    shaded = none if shadows is None else f"{spelling(shadows)} for {casting} light{'s' * (casting != 1)}"
     by_gradient = ("lights", "gradient")
     return (
         Part("lights", shows and bool(lights), shown if lights else none),
-        Part("shading", shading is not None, describe(shading) or none, by_gradient if shading is not None else ()),
+        Part("shading", shading is not None, spelling(shading) or none, by_gradient if shading is not None else ()),
         Part("shadows", shadows is not None, shaded, ("light march",) if shadows is not None else ()),
         Part(
             "scattering",
             scattering is not None,
-            describe(scattering) or none,
+            spelling(scattering) or none,
             by_gradient[: 1 + asks["scattering"]] if scattering else (),
         ),
         *_environment_parts(scene),
@@ -140,7 +140,7 @@ def _environment_parts(scene: Scene) -> tuple[Part, ...]:
     )
     around = none if environment is None else f"environment lighting, {len(environment.coefficients)} coefficients"
     needs = ("environment", "gradient") if material is not None and material.needs_gradient else ("environment",)
-    shown = none if material is None else describe(material)
+    shown = none if material is None else spelling(material)
     made = (
         ""
         if radiance_transfer is None
@@ -154,7 +154,7 @@ def _environment_parts(scene: Scene) -> tuple[Part, ...]:
         Part(
             "radiance transfer",
             radiance_transfer is not None,
-            f"{describe(radiance_transfer)}, {made}" if radiance_transfer is not None else none,
+            f"{spelling(radiance_transfer)}, {made}" if radiance_transfer is not None else none,
             ("environment", "light march") if radiance_transfer is not None else (),
         ),
     )
