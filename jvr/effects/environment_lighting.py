@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.effects.own_shadow import OwnShadow, ShadedSegment, own_shadow_of
+from jvr.effects.self_shadow import SelfShadow, ShadedSegment, self_shadow_of
 from jvr.effects.shading import surface_weight
 from jvr.model.harmonics.basis import band_of, basis, count
 from jvr.model.material import HarmonicMaterial, Lobe, SymmetryAxis
@@ -81,7 +81,7 @@ class EnvironmentLighting(eqx.Module):
     positions: Float[Array, "classes"]
     threshold: Scalar
     clamped: bool = eqx.field(static=True)
-    shadow: OwnShadow | None = None
+    shadow: SelfShadow | None = None
 
     @property
     def needs_gradient(self) -> bool:
@@ -155,7 +155,7 @@ def environment_lighting(
     clamped: bool,
     order: int,
     from_samples: bool,
-    shadow: OwnShadow | None = None,
+    shadow: SelfShadow | None = None,
 ) -> EnvironmentLighting:
     """`EnvironmentLighting` up to an order; `from_samples`: each sample brings the coefficients of its light."""
     tinted, unmodulated = (None if lobe is None else PlaneTable.of(lobe, order) for lobe in (material.tinted, material.plain))
@@ -210,7 +210,7 @@ def environment_lighting_of(scene: Scene) -> EnvironmentLighting:
     material: HarmonicMaterial = scene.material.projected(scene.material_order)
     exact = scene.radiance_transfer is not None and scene.radiance_transfer.exact
     order = material.order if exact else min(material.order, environment.order)
-    shadow = own_shadow_of(scene, albedo_of(scene))
+    shadow = self_shadow_of(scene, albedo_of(scene))
     return environment_lighting(
         material, environment.coefficients, clamped=environment.clamped, order=order, from_samples=exact, shadow=shadow
     )

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from jvr.effects.cut import CutFaces
-from jvr.effects.own_shadow import ShadedSegment
+from jvr.effects.self_shadow import ShadedSegment
 from jvr.effects.shading import surface_weight
 from jvr.march.shaders import OpticalShader, PreIntegratedShader, where_known
 from jvr.march.steps import Point, Sample

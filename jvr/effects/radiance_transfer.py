@@ -44,7 +44,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
     Opacities `o` of a node's width of medium, at a node and one node further in all directions, give a surface where the material has a
     normal: with their change `m` by Sobel's weights it is one by the weight `max(o) m^2 / (m^2 + surface^2)`, `solid`. Then rays begin
     above it, `1.75 solid` nodes along the normal, so that nodes below and above a surface know the same light; what the medium up to
-    there takes is found at each sample (`jvr.effects.own_shadow`). They are sent into the part of the sphere that is not below it: with
+    there takes is found at each sample (`jvr.effects.self_shadow`). They are sent into the part of the sphere that is not below it: with
     `alpha = pi / 2 (1 - solid)`, directions within `pi / 2 + alpha` of the normal are drawn with density `1 / (2 pi (1 + sin alpha))`,
     `rays` of them on a spiral of equal areas, and what they carry is projected on harmonics. The others count as their mean.
 

@@ -1,4 +1,4 @@
-"""The shadow that a surface casts on itself: what the medium just in front of a sample takes of the light.
+"""Self-shadowing: what the medium just in front of a sample takes of the light.
 
 Light of radiance transfer is known at nodes that lie further apart than a surface is thick, and so it is that above the surface. What
 such nodes miss is known at the sample: the scalar goes linearly along the normal, so that the optical depth `tau` from the sample up to
@@ -36,8 +36,8 @@ class ShadedSegment(NamedTuple):
     dt: Scalar
 
 
-class OwnShadow(eqx.Module):
-    """Of a scene's surfaces.
+class SelfShadow(eqx.Module):
+    """Self-shadowing of a scene's surfaces.
 
     `width`: how far in front of a sample the medium counts as near where there is nothing but a surface, as far as rays of nodes begin
     above it; `of_opacity`: gradients are those of the extinction; `bleeds`: the medium that is near shows its colour instead of a shadow,
@@ -80,14 +80,14 @@ class OwnShadow(eqx.Module):
         return tau
 
 
-def own_shadow_of(scene: Scene, albedo: Any) -> OwnShadow | None:
-    """The shadow that surfaces cast on themselves, where light of nodes arrives at them; with the transfer function that the nodes know.
+def self_shadow_of(scene: Scene, albedo: Any) -> SelfShadow | None:
+    """The self-shadowing of surfaces, where light of nodes arrives at them; with the transfer function that the nodes know.
     `albedo`: where rays of the nodes pick up the material's colour, that under light of one from everywhere."""
     if scene.radiance_transfer is None or scene.material is None or not scene.material.needs_gradient:
         return None
     width = scene.radiance_transfer.lift(scene.volume)
     transfer = scene.radiance_transfer.transfer_function(scene)
-    return OwnShadow(transfer, width, scene.normals.of_opacity, scene.radiance_transfer.bleeding is not None, albedo)
+    return SelfShadow(transfer, width, scene.normals.of_opacity, scene.radiance_transfer.bleeding is not None, albedo)
 
 
 def _ramp(sigma: Scalar, slope: Scalar, width: Scalar) -> Scalar:
