@@ -1,4 +1,4 @@
-"""Functions with a delicate limit, and their derivatives; reads and writes that the compiler does well."""
+"""Numerical primitives: functions with a delicate limit, and their derivatives; reads and writes that the compiler does well."""
 
 from typing import TypeVar
 

@@ -1,4 +1,4 @@
-"""Surfaces where a clipping box cuts the medium open.
+"""Cut faces: normals of the surfaces where a clipping box cuts the medium open.
 
 Inside of what is cut the gradient is that of noise, and within a voxel of the cut it is made of voxels that are not there. A layer behind
 each face of the box is therefore shaded with the normal of the face. That a cut is lit as a surface and what lies behind it by its gradient
@@ -15,8 +15,8 @@ from jvr.types import Scalar, Triple
 
 
 class CutFaces(eqx.Module):
-    """The faces of a box. `layer`: a point up to this world length behind a face belongs to it, one that is twice as deep does not, with
-    a smooth cubic in between."""
+    """The cut faces of a clipping box. `layer`: a point up to this world length behind a face belongs to it, one that is twice as deep
+    does not, with a smooth cubic in between."""
 
     box: ClippingBox
     layer: Scalar

@@ -20,7 +20,7 @@ from jvr.types import Affine, Channels, Scalar, Triple
 
 
 class DeepShadowMap(AbstractShadows):
-    """A map of rays, along each of which transmittance is kept as at most `layers` straight pieces.
+    """A deep shadow map: rays of a light, along each of which transmittance is kept as at most `layers` straight pieces.
 
     A piece goes on as long as the straight line from its start through the transmittance at its end stays within `error` of all that it
     passes. Where `layers` pieces do not suffice, the last one goes straight to the end of the ray, with an error that nothing bounds:
@@ -70,7 +70,7 @@ class ShadowStats(NamedTuple):
 
 
 class DeepMap(eqx.Module):
-    """For each ray of a light, the depths `w` where pieces meet and the transmittances there."""
+    """The deep shadow map of one light: for each ray, the depths `w` where pieces meet and the transmittances there."""
 
     space: AbstractLightSpace
     depths: Float[Array, "u v nodes channels"]
@@ -90,7 +90,7 @@ class DeepMap(eqx.Module):
 
 
 class DeepVisibility(AbstractVisibility):
-    """A deep map for each light, or `None` for those that nothing shades."""
+    """Visibility by a deep shadow map for each light, or `None` for those that nothing shades."""
 
     world_from_grid: Affine
     maps: tuple[DeepMap | None, ...]

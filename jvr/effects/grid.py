@@ -11,8 +11,8 @@ from jvr.types import Channels, Triple
 
 
 class Grid(eqx.Module):
-    """`cells`: their number along each axis, one less than that of nodes, and 0 along an axis of one node. All channels of a node lie side
-    by side, so that one read brings them all."""
+    """Nodes of a regular grid. `cells`: their number along each axis, one less than that of nodes, and 0 along an axis of one node. All
+    channels of a node lie side by side, so that one read brings them all."""
 
     rows: Float[Array, "nodes channels"]
     cells: tuple[int, int, int] = eqx.field(static=True)

@@ -1,4 +1,4 @@
-"""Coordinates as a light sees the volume, and what lies along its rays.
+"""Light space: coordinates as a light sees the volume, and what lies along its rays.
 
 `(u, v)` in [-1, 1]^2 is a ray of the light and `w` in [0, 1] how far along it a point lies, from where the volume may begin to where it
 ends. For directional light rays are parallel. Those of a point are fanned out over the cone that holds the volume, or over all directions
@@ -43,7 +43,7 @@ class AbstractLightSpace(eqx.Module):
 
 
 class ParallelSpace(AbstractLightSpace):
-    """Directional light: `center + half_u u U + half_v v V + half_w (2 w - 1) A`."""
+    """The light space of directional light: `center + half_u u U + half_v v V + half_w (2 w - 1) A`."""
 
     center: Vector
     axes: Float[Array, "3 3"]
@@ -62,8 +62,8 @@ class ParallelSpace(AbstractLightSpace):
 
 
 class FanSpace(AbstractLightSpace):
-    """A point: unit directions are placed at `rho = sin(theta / 2) / rim` about the axis, 1 at the edge of the cone of its rays,
-    which go from `near` to `far`."""
+    """The light space of a point: unit directions lie at `rho = sin(theta / 2) / rim` about the axis, 1 at the edge of the cone of its
+    rays, which go from `near` to `far`."""
 
     position: Vector
     axes: Float[Array, "3 3"]

@@ -1,4 +1,4 @@
-"""The light at a sample, and what it adds to the medium's own: `j = sigma_t (rgb a + b)`.
+"""Local lighting: the light at a sample, and what it adds to the medium's own, `j = sigma_t (rgb a + b)`.
 
 `a` is what shading makes of the light (1 without shading), `b` what is reflected in the light's own colour and what is scattered:
 
@@ -94,7 +94,7 @@ class LitShader(OpticalShader):
 
 
 class LitPreIntegratedShader(LitShader, PreIntegratedShader):
-    """The scalar linear along a segment, the light that of the mean of its ends."""
+    """Pre-integration in a lit medium: the scalar linear along a segment, the light that of the mean of its ends."""
 
     def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples

@@ -30,12 +30,13 @@ LIFT = 1.75
 
 
 class TransferBleeding(eqx.Module):
-    """Rays pick up the transfer function's colour of what they pass: materials may be exchanged without a new projection."""
+    """Colour bleeding of the transfer function's colours, which rays pick up of what they pass: materials may be exchanged without a new
+    projection."""
 
 
 class MaterialBleeding(eqx.Module):
-    """Rays pick up what the material reflects towards their origin, times the transfer function's colour where that tints it: a new
-    material needs a new projection."""
+    """Colour bleeding of what the material reflects towards the origin of a ray, times the transfer function's colour where that tints
+    it: a new material needs a new projection."""
 
 
 class RadianceTransfer(AbstractRadianceTransfer):

@@ -110,7 +110,8 @@ class Phong(Lambert):
 
 
 class BlinnPhong(Phong):
-    """As `Phong` with `specular E max(n . h, 0)^shininess`, `h` half-way between the directions to eye and light."""
+    """Specular (Blinn-Phong) surfaces: as `Phong` with `specular E max(n . h, 0)^shininess`, `h` half-way between the directions to eye
+    and light."""
 
     # Written out because type checkers take a dataclass's fields for its arguments where it has no constructor of its own.
     def __init__(

@@ -20,7 +20,7 @@ LAYERS = 256
 
 
 class ShadowMap(AbstractShadows):
-    """A map of the depth at which each of the light's rays has lost `threshold` of its light: what is behind is dark.
+    """A shadow map: the depth at which each of the light's rays has lost `threshold` of its light: what is behind is dark.
 
     For opaque occluders only. It does not converge to `ShadowRays` in translucent media, whatever the map's size: light is there or not,
     and what is half-way through a cloud has a hard shadow. It has no useful gradient: both depths and comparison are detached, so that
@@ -70,7 +70,7 @@ class ShadowMap(AbstractShadows):
 
 
 class DepthMap(eqx.Module):
-    """The depth `w` from which on each ray of a light is dark, infinite where it never is."""
+    """The shadow map of one light: the depth `w` from which on each ray is dark, infinite where it never is."""
 
     space: AbstractLightSpace
     depths: Float[Array, "u v"]
@@ -94,7 +94,7 @@ class DepthMap(eqx.Module):
 
 
 class MapVisibility(AbstractVisibility):
-    """A map for each light, or `None` for those that nothing shades."""
+    """Visibility by a shadow map for each light, or `None` for those that nothing shades."""
 
     world_from_grid: Affine
     maps: tuple[DepthMap | None, ...]

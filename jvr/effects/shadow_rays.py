@@ -20,7 +20,7 @@ from jvr.types import Channels, Scalar
 
 
 class ShadowRays(AbstractShadows):
-    """A ray from every sample to every light, the reference that all other methods approximate.
+    """Shadow rays: one from every sample to every light, the reference that all other methods approximate.
 
     The transmittance is `exp(-tau)` with the optical depth `tau` of the same transfer function, in each of its channels, by the midpoint
     rule from the sample to the light or to where the volume (or its clipping box) ends.
@@ -50,7 +50,7 @@ class ShadowRays(AbstractShadows):
 
 
 class RayVisibility(AbstractVisibility):
-    """Shadow rays through `medium`, which emits nothing."""
+    """Visibility by shadow rays through `medium`, which emits nothing."""
 
     clipping: ClippingBox | None
     lights: tuple[AbstractLight, ...]

@@ -47,7 +47,7 @@ class ShadowVolume(AbstractShadows):
 
 
 class OpacityShadowMap(AbstractShadows):
-    """A map of rays with the transmittance at equally distant layers (Kim and Neumann 2001), linear in between.
+    """An opacity shadow map: rays with the transmittance at equally distant layers (Kim and Neumann 2001), linear in between.
 
     **Arguments:** `texels`: rays along each axis of the map; `layers`: of optical depth along each. Detail across the light is kept by the
     texels; between two layers transmittance is a straight line.
@@ -86,7 +86,7 @@ class ClearGrid(eqx.Module):
 
 
 class DepthVisibility(AbstractVisibility):
-    """Optical depth from each light, or `None` for those that nothing shades."""
+    """Visibility by optical depth from each light, or `None` for those that nothing shades."""
 
     world_from_grid: Affine
     grids: tuple[ClearGrid | None, ...]

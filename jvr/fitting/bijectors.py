@@ -49,7 +49,7 @@ def _unbounded(unconstrained: Float[np.ndarray, "..."]) -> Bounds:
 
 
 class Identity(AbstractBijector):
-    """Any real value."""
+    """The identity: any real value."""
 
     def forward(self, unconstrained: Float[Array, "..."]) -> Float[Array, "..."]:
         return unconstrained
@@ -94,7 +94,7 @@ TRUST_RADIUS = 2.0
 
 
 class Softplus(AbstractBijector):
-    """Values above `low`, `low + scale * log(1 + exp(x))`; `scale` is a typical distance from it, in the unknown's own unit."""
+    """Softplus: values above `low`, `low + scale * log(1 + exp(x))`; `scale` is a typical distance from it, in the unknown's own unit."""
 
     scale: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
     low: float = eqx.field(static=True, default=0.0)
@@ -114,7 +114,7 @@ class Softplus(AbstractBijector):
 
 
 class Sigmoid(AbstractBijector):
-    """Values between `low` and `high`."""
+    """A sigmoid: values between `low` and `high`."""
 
     low: float = eqx.field(static=True, default=0.0)
     high: float = eqx.field(static=True, default=1.0)

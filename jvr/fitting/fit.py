@@ -1,4 +1,4 @@
-"""`jvr.fit`: the scene that explains the images."""
+"""`jvr.fit`: inverse rendering, the arrays of a scene that explain its images."""
 
 import contextlib
 import sys

@@ -13,7 +13,7 @@ NULL_FRACTION = 1e-4
 
 
 class Identifiability(NamedTuple):
-    """Standard errors and what is behind them.
+    """How well the images determine the unknowns: standard errors and what is behind them.
 
     - `standard_errors`: of each unknown, in its own unit; infinite where the images do not determine it.
     - `variance`: of the residuals, `sum w r^2 / (m - rank)`.

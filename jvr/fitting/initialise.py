@@ -1,4 +1,4 @@
-"""Where a fit starts."""
+"""Initial values of a fit: a flat transfer function, and the colours that suit given extinctions."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -87,8 +87,8 @@ class Undamped(AbstractDescent):
 
 
 class AlongDogleg(AbstractDescent):
-    """From the minimum along the gradient towards the minimum of the model, as far as `step_size` allows (Powell 1970). Both lie within the
-    bounds, and so does what is between them."""
+    """The dogleg: from the minimum along the gradient towards the minimum of the model, as far as `step_size` allows (Powell 1970). Both
+    lie within the bounds, and so does what is between them."""
 
     def move(self, model: Model, step_size: float) -> Float[np.ndarray, "n"]:
         cauchy, newton = self._cauchy(model), model.minimum()
@@ -112,7 +112,7 @@ class AlongDogleg(AbstractDescent):
 
 
 class ChunkedState(NamedTuple):
-    """`done`: 0 going on, 1 converged, 2 no finite value, 3 stalled."""
+    """The state of a least-squares solver over chunks. `done`: 0 going on, 1 converged, 2 no finite value, 3 stalled."""
 
     unconstrained: np.ndarray
     loss: np.ndarray

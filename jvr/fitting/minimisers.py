@@ -40,7 +40,8 @@ def _value(function: Any, unconstrained: Array) -> Array:
 
 
 class GradientState(NamedTuple):
-    """`inner` is the other library's state; `best` and `best_loss` the best point it has accepted; `factor` that of `Scaled`."""
+    """The state of a gradient solver: `inner` is the other library's state; `best` and `best_loss` the best point it has accepted;
+    `factor` that of `Scaled`."""
 
     unconstrained: Array
     inner: Any

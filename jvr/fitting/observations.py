@@ -1,4 +1,4 @@
-"""Target images as one long list of rays with their target colours, and samples kept along them."""
+"""Observations: target images as one long list of rays with their colours, and samples cached along them."""
 
 import warnings
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What a solver is: it takes one step at a time, so that a fit can show progress, save itself and stop in between."""
+"""The interface of a solver: it takes one step at a time, so that a fit can show progress, save itself and stop in between."""
 
 import abc
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The first picture of somebody's own volume: what of it is shown, in which colours and which light, when nobody has said so.
+"""Defaults for a volume without a configuration: what of it is shown, in which colours and which light.
 
 What is guessed is said in a line each: `FirstPicture.notes`.
 """

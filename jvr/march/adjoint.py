@@ -1,4 +1,4 @@
-"""Reverse mode through a march, by replaying it.
+"""The replay adjoint: reverse mode through a march, by replaying it back to front.
 
 The segments of every ray are walked a second time, back to front, so that nothing is stored for a step. With `B` the radiance from
 behind a segment as it leaves the next one, `B <- e + exp(-dtau) B`, and `T` the transmittance in front of the segment,
@@ -69,7 +69,7 @@ class SuffixRadiance(NamedTuple):
 
 
 class BackwardRays(NamedTuple):
-    """A batch of rays that are walked backwards, from segment `steps - 1` on; `front` and `last` are those of the forward march's
+    """Rays of a wavefront that are walked backwards, from segment `steps - 1` on; `front` and `last` are those of the forward march's
     `ReplayRecord`."""
 
     active: ActiveRays

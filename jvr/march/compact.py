@@ -1,4 +1,4 @@
-"""Work on the elements that a mask selects, at a cost that is proportional to their number.
+"""Stream compaction: work on the elements that a mask selects, at a cost that is proportional to their number.
 
 The mask is packed into words of 32 bits. The `k`-th selected element is then found by a binary search over the running count of the
 words and five halvings inside of one: cheaper than a list of all indices where few elements are selected.
@@ -21,7 +21,7 @@ WORD = 32
 
 
 class Selection(NamedTuple):
-    """The elements of a mask: 32 of them to a word, and how many are selected up to the end of each word."""
+    """The compacted elements of a mask: 32 of them to a word, and how many are selected up to the end of each word."""
 
     words: UInt32[Array, "words"]
     through: Int[Array, "words"]

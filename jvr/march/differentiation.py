@@ -19,7 +19,7 @@ from jvr.types import Scalar
 
 
 class AbstractAdjoint(eqx.Module):
-    """A way to differentiate a march."""
+    """An adjoint: a way to differentiate a march."""
 
     @abc.abstractmethod
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
@@ -45,7 +45,7 @@ class Forward(AbstractAdjoint):
 
 
 class Rows(AbstractAdjoint):
-    """Forward and reverse mode and any nesting with `vmap`, for few unknowns.
+    """The per-ray Jacobian: forward and reverse mode and any nesting with `vmap`, for few unknowns.
 
     The derivative of each ray with respect to every perturbed array is computed once and held, `rays x unknowns` numbers; a
     tangent is that matrix times a direction. Entries of a table come out of one replay, with hat functions, at about the cost of a

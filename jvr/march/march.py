@@ -1,4 +1,4 @@
-"""THE loop: a batch of rays, front to back, one segment of every ray at a time."""
+"""THE loop of ray marching: a batch of rays, front to back, one segment of every ray at a time."""
 
 import dataclasses
 import functools
@@ -25,7 +25,7 @@ class MarchOptions:
 
 
 class Marched(NamedTuple):
-    """What the loop returns for each ray.
+    """What a march returns for each ray.
 
     `radiance`: three components, or none where nothing is emitted; `tau`: optical depth, one or three components, or none;
     `distance`: opacity-weighted distance from the entry, not yet divided by the opacity, a component for each of `tau`, or none;
@@ -39,7 +39,7 @@ class Marched(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """How far a ray has come: its sums, the segment that comes next, how many it sampled and, for each channel of optical depth, the
+    """The state of a ray in a march: its sums, the segment that comes next, how many it sampled and, for each channel of optical depth, the
     last segment that light from behind could still reach the eye through (`last`), with the optical depth in front of it (`front`)."""
 
     sums: Sums

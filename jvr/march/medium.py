@@ -1,4 +1,4 @@
-"""What rays march through: the contracts between the loop and what fills it.
+"""Fields, shaders and visibility: the contracts between the ray marching loop and the medium that it goes through.
 
 The loop knows no effect by name. It is handed a `Medium`: a field that is resampled at a point, a shader that turns what was resampled
 into emitted radiance and optical depth, and where the scene asks for it, how much light arrives.
@@ -22,7 +22,7 @@ DENSEST = 64.0
 
 
 class AbstractField(eqx.Module):
-    """What is resampled along rays; its arrays may be large."""
+    """A field that is resampled along rays; its arrays may be large."""
 
     @abc.abstractmethod
     def resample(self, point: Point) -> Sample:
@@ -35,7 +35,7 @@ class AbstractField(eqx.Module):
 
 
 class AbstractVisibility(eqx.Module):
-    """How much of each light reaches a point, and of the environment's where the scene asks for it."""
+    """Visibility: how much of each light reaches a point, and of the environment's where the scene asks for it."""
 
     @abc.abstractmethod
     def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
@@ -52,7 +52,7 @@ class AbstractVisibility(eqx.Module):
 
 
 class AbstractShader(eqx.Module):
-    """What a segment emits and absorbs: everything between the scalar and the eye. Its arrays are small."""
+    """A shader, what a segment emits and absorbs: everything between the scalar and the eye. Its arrays are small."""
 
     # Where in a segment the field is resampled, from -1/2 at its front to 1/2 at its back.
     quadrature_nodes: ClassVar[tuple[float, ...]] = (0.0,)

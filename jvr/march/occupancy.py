@@ -24,10 +24,10 @@ RADII = (0, 1, 2, 3, 5, 8, 13, 21)
 
 
 class Occupancy(eqx.Module):
-    """`empty_radius[b]`: 0 where brick `b` may be visible, else a number such that every brick nearer than it, by the largest of the three
-    differences of indices, is empty. `empty_radius_of_slopes`: the same of bricks where extinction has a derivative in the scalar, as at a
-    value that lies where an interval of a table begins to be visible; `None` where `empty_radius` itself is what derivatives skip. `size`:
-    voxels along an edge of a brick."""
+    """Which bricks are occupied, and Chebyshev distances to them. `empty_radius[b]`: 0 where brick `b` may be visible, else a number such
+    that every brick nearer than it, by the largest of the three differences of indices, is empty. `empty_radius_of_slopes`: the same of
+    bricks where extinction has a derivative in the scalar, as at a value that lies where an interval of a table begins to be visible;
+    `None` where `empty_radius` itself is what derivatives skip. `size`: voxels along an edge of a brick."""
 
     empty_radius: UInt8[Array, "bx by bz"]
     empty_radius_of_slopes: UInt8[Array, "bx by bz"] | None

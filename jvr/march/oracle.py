@@ -40,7 +40,7 @@ class DistanceField(eqx.Module):
 
 
 class AbstractOracle(eqx.Module):
-    """Where samples may be far apart. `brick`: voxels along an edge of the bricks that are looked at."""
+    """An oracle: where samples may be far apart. `brick`: voxels along an edge of the bricks that are looked at."""
 
     brick: ClassVar[int]
 

@@ -1,4 +1,4 @@
-"""Derivatives of every ray with respect to every entry of a tabulated transfer function, out of one replay.
+"""The per-ray Jacobian with respect to the entries of a tabulated transfer function, out of one replay.
 
 Entry `p` has weight `hat_p(s) = max(0, 1 - |coordinate(s) - p|)` in a sample, so
 
@@ -33,7 +33,7 @@ BLOCK = 8
 
 
 class TableRows(NamedTuple):
-    """Rows of the Jacobian of a march. Each is `(rays, entries)`, for one channel of radiance or optical depth.
+    """The per-ray Jacobian of a march, by rows. Each is `(rays, entries)`, for one channel of radiance or optical depth.
 
     `radiance_rgb[c]`, `radiance_sigma[c]`: of radiance channel `c` with respect to column `c` of the colours, and to the extinctions
     (column `c` of them where they are coloured); `tau_sigma[c]`: of optical depth `c` with respect to the extinctions. Those of

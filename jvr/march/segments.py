@@ -1,4 +1,4 @@
-"""One segment of every ray: which one comes next, what it emits and absorbs, and how much light reaches it."""
+"""One segment of every ray of a wavefront: which one comes next, what it emits and absorbs, and how much light reaches it."""
 
 import functools
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Shaders that know nothing but the optical model: an unlit medium."""
+"""Shaders of an unlit medium, by the optical model alone."""
 
 from typing import Any, ClassVar
 

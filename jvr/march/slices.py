@@ -35,7 +35,7 @@ NEVER = 2**30
 
 @dataclasses.dataclass(frozen=True)
 class SliceOptions:
-    """Static choices.
+    """Static choices of adaptive sampling on slices.
 
     `levels`: of the pyramid above the finest, whose size `width` x `height` is divisible by `2^levels`; `termination`: a pixel ends
     with the first block behind which its transmittance, in every channel, is at most this; `evaluate_segment(shading, (front, back,

@@ -1,4 +1,4 @@
-"""Where samples lie along a ray.
+"""Sample positions along a ray.
 
 Segments of length `dt` tile the part of a ray that lies inside the medium, from its entry to its exit; the last one is
 shortened. Each is sampled at its own midpoint. Positions come from the segment's index, never by accumulation, and are measured
@@ -38,7 +38,7 @@ class Point(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What is known at a point; parts that nobody asks for are empty.
+    """What is resampled at a point; fields that nobody asks for are empty.
 
     `s`: the scalar; `gradient`: its derivatives along the grid axes, or those of the extinction; `neighbours`: what else a gradient is made
     of, such as scalars around the point before the transfer function; `light`: for each light, the transmittance between it and the point;

@@ -103,7 +103,8 @@ class BlinnPhongBRDF(AbstractGlossyBRDF):
 
 
 class PhaseBRDF(AbstractBRDF):
-    """A medium without surface: tinted `albedo p(cos theta)`, `cos theta = -w_o . w_i`, and no cosine of `w_i`.
+    """A phase function as a material, a medium without surface: tinted `albedo p(cos theta)`, `cos theta = -w_o . w_i`, and no cosine of
+    `w_i`.
 
     **Arguments:** `phase`: any phase function, such as `jvr.HenyeyGreenstein(0.6)`; `albedo`: in [0, 1], a number or `(3,)`.
     All differentiable. **Raises** `ValueError` otherwise.

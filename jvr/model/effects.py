@@ -1,4 +1,4 @@
-"""What effects promise, so that a scene can hold them and no module of theirs is imported where it does not."""
+"""Interfaces of the effects, so that a scene can hold them and no module of theirs is imported where it does not."""
 
 import abc
 import dataclasses
@@ -11,7 +11,7 @@ from jvr.types import Channels, Scalar, Triple
 
 
 class AbstractShading(eqx.Module):
-    """How a surface reflects light."""
+    """Local shading: how a surface reflects light."""
 
     @abc.abstractmethod
     def ambient_reflectance(self) -> Scalar:
@@ -28,7 +28,7 @@ class AbstractShading(eqx.Module):
 
 
 class AbstractScattering(eqx.Module):
-    """How the medium scatters light."""
+    """Single scattering: how the medium scatters light."""
 
     @property
     @abc.abstractmethod
@@ -49,7 +49,7 @@ class AbstractScattering(eqx.Module):
 
 
 class AbstractShadows(eqx.Module):
-    """A way to find the transmittance between lights and points."""
+    """A shadow algorithm: a way to find the transmittance between lights and points."""
 
     @abc.abstractmethod
     def visibility(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
@@ -62,7 +62,7 @@ class AbstractShadows(eqx.Module):
 
 
 class AbstractMaterial(eqx.Module):
-    """How a point sends light from all directions to the eye."""
+    """A material: how a point sends light from all directions to the eye."""
 
     @property
     @abc.abstractmethod
@@ -75,7 +75,7 @@ class AbstractMaterial(eqx.Module):
 
 
 class AbstractRadianceTransfer(eqx.Module):
-    """How the medium around a point changes the light of the environment that reaches it."""
+    """Radiance transfer: how the medium around a point changes the light of the environment that reaches it."""
 
     # Whether samples bring the light that reaches them, and not a fraction of all of it.
     exact: eqx.AbstractVar[bool]

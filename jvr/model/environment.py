@@ -19,7 +19,8 @@ from jvr.types import ArrayLike
 
 
 class EnvironmentLight(eqx.Module):
-    """Radiance that arrives from direction `d` (pointing away from the scene): `L_i(d) = sum_j c_j Y_j(d)`, the same at every point.
+    """An environment light: radiance that arrives from direction `d` (pointing away from the scene): `L_i(d) = sum_j c_j Y_j(d)`, the
+    same at every point.
 
     **Arguments:** `coefficients`: `((order + 1)^2, 3)`, linear RGB, of `jvr.sh`'s functions in the world's axes; differentiable. `clamped`:
     where the series rings below zero, what a sample reflects is cut off at zero; without it negative radiance may reach the picture.

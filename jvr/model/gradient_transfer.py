@@ -14,7 +14,8 @@ from jvr.types import ArrayLike, Channels, Scalar
 
 
 class GradientTransfer(AbstractTransfer):
-    """A table over the scalar and the length of its gradient, bilinear: materials by value, boundaries between them by gradient.
+    """A two-dimensional transfer function, a bilinear table over the scalar and the length of its gradient: materials by value,
+    boundaries between them by gradient.
 
     **Arguments:** `rgb`: `(n, m, 3)`, linear; `sigma_t`: `(n, m)` or, coloured, `(n, m, 3)`, per world length, not negative; `domain`:
     `(low, high)` scalars of the first and last row; `magnitudes`: `(low, high)` lengths of the gradient, in data units per world length,

@@ -1,4 +1,4 @@
-"""What a derived array was made of: by identity, or by the content.
+"""Cache keys of derived arrays: what one was made of, by identity or by content.
 
 What is computed once and kept beside the arrays that it was made of goes stale when one of these is replaced. JAX's arrays do not change,
 so that the very same array in the same place is proof that nothing was replaced; traced arrays prove nothing. Where computing anew is

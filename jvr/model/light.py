@@ -1,4 +1,4 @@
-"""Lights: from where, and how much of it, light arrives at a point when nothing is in its way.
+"""Lights: direction and irradiance of what reaches a point when nothing is in its way.
 
 `direction` is the way that light travels, in the world; `irradiance` is power per unit area perpendicular to it. Colours are linear RGB, a
 single number is grey. Everything is differentiable.
@@ -47,7 +47,7 @@ class AbstractLight(eqx.Module):
 
 
 class DirectionalLight(AbstractLight):
-    """Parallel light, as from the sun.
+    """Directional light: parallel, as from the sun.
 
     **Arguments:** `direction`: `(3,)`, the way the light travels, of any length but zero; `irradiance`: a number or `(3,)`, not negative.
     """
@@ -162,7 +162,7 @@ class SpotLight(AbstractLight):
 
 
 class HeadLight(AbstractLight):
-    """Light that comes from the eye along each ray; it casts no shadows. `irradiance`: a number or `(3,)`, not negative."""
+    """A headlight: light that comes from the eye along each ray; it casts no shadows. `irradiance`: a number or `(3,)`, not negative."""
 
     casts_shadows: ClassVar[bool] = False
 
@@ -179,7 +179,7 @@ class HeadLight(AbstractLight):
 
 
 class AmbientLight(eqx.Module):
-    """The same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
+    """Ambient light: the same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
 
     radiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
 

@@ -32,7 +32,7 @@ ROUGHNESS = Interval(0.001, 1.0)
 
 
 class MicrofacetBRDF(AbstractBRDF):
-    """A material of metallic workflow, see this file's first lines.
+    """A microfacet material (GGX, Smith, Schlick) of metallic workflow, see this file's first lines.
 
     - Not metallic: unmodulated microfacets with `F0 = reflectance_at_normal` over a tinted diffuse base, which receives and lets out what
       the microfacets do not reflect: `base / pi (1 - E(w_o)) (1 - E(w_i)) / (1 - mean of E) max(n . w_i, 0)`, where `E` is the fraction

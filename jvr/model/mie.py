@@ -30,7 +30,7 @@ DIAMETER = Interval(5.0, 50.0)
 
 
 class Draine(AbstractPhase):
-    """`p = HG(g) (1 + alpha cos^2 theta) / (1 + alpha (1 + 2 g^2) / 3)` (Draine 2003, ApJ 598, 1017).
+    """Draine's phase function, `p = HG(g) (1 + alpha cos^2 theta) / (1 + alpha (1 + 2 g^2) / 3)` (Draine 2003, ApJ 598, 1017).
 
     `alpha = 0` is Henyey-Greenstein; `g = 0`, `alpha = 1` is Rayleigh; `alpha = 1` is Cornette and Shanks 1992. The mean cosine is
     not `g`.
@@ -92,7 +92,7 @@ class JendersieEon(AbstractPhase):
 
 
 class TabulatedPhase(AbstractPhase):
-    """Measured or computed values at some angles, linear in `cos theta` between them and scaled to integrate to 1.
+    """A tabulated phase function: values at some angles, linear in `cos theta` between them and scaled to integrate to 1.
 
     **Arguments:** `angles`: `(n,)` in radians, strictly increasing from 0 (forward) to pi; `values`: `(n,)` or `(n, 3)`, not negative,
     in any unit. Differentiable in the values. **Raises** `ValueError` otherwise, and where all values are zero.

@@ -25,7 +25,7 @@ Resampled = tuple[Float[Array, "..."], Triple, Channels]
 
 
 class AbstractNormals(eqx.Module):
-    """How a gradient is estimated. With `of_opacity` it is that of the extinction, after the transfer function (mean of its channels),
+    """A gradient estimator. With `of_opacity` it is that of the extinction, after the transfer function (mean of its channels),
     else that of the scalar."""
 
     of_opacity: bool = eqx.field(static=True, default=False)

@@ -11,7 +11,7 @@ from jvr.types import Channels, Scalar
 
 
 class AbstractOpticalModel(eqx.Module):
-    """How emission and extinction along a segment of length `dt` become radiance and optical depth."""
+    """An optical model: how emission and extinction along a segment of length `dt` become radiance and optical depth."""
 
     @abc.abstractmethod
     def evaluate_segment(self, classified: Classified, dt: Scalar) -> tuple[Channels, Channels]:

@@ -57,7 +57,7 @@ class ScatteringAngle(NamedTuple):
 
 
 class AbstractPhase(eqx.Module):
-    """A distribution of scattered light over the sphere."""
+    """A phase function: the distribution of scattered light over the sphere."""
 
     @abc.abstractmethod
     def evaluate(self, angle: ScatteringAngle) -> Channels:
@@ -102,7 +102,7 @@ class AbstractPhase(eqx.Module):
 
 
 class Isotropic(AbstractPhase):
-    """The same in all directions: `p = 1 / (4 pi)`."""
+    """The isotropic phase function: `p = 1 / (4 pi)`."""
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return (jnp.full_like(angle.cos, _UNIFORM),)
@@ -116,7 +116,8 @@ class Isotropic(AbstractPhase):
 
 
 class Rayleigh(AbstractPhase):
-    """Particles much smaller than the wavelength: `p = 3 / (16 pi) (1 + cos^2 theta)`, for unpolarised light."""
+    """Rayleigh's phase function, of particles much smaller than the wavelength: `p = 3 / (16 pi) (1 + cos^2 theta)`, for unpolarised
+    light."""
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return (0.75 * _UNIFORM * (1.0 + angle.cos * angle.cos),)
@@ -149,7 +150,7 @@ def sample_henyey_greenstein(g: Numbers, u: Numbers) -> ScatteringAngle:
 
 
 class HenyeyGreenstein(AbstractPhase):
-    """One lobe of asymmetry `g`, see `henyey_greenstein`; forward for `g > 0`, isotropic for `g = 0`.
+    """The Henyey-Greenstein phase function of asymmetry `g`, see `henyey_greenstein`; forward for `g > 0`, isotropic for `g = 0`.
 
     **Arguments:** `g`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either; differentiable. **Raises** `ValueError` otherwise.
     """
@@ -171,7 +172,7 @@ class HenyeyGreenstein(AbstractPhase):
 
 
 class DoubleHenyeyGreenstein(AbstractPhase):
-    """Two lobes, usually one forward and one backward: `weight HG(g1) + (1 - weight) HG(g2)`.
+    """Two Henyey-Greenstein lobes, usually one forward and one backward: `weight HG(g1) + (1 - weight) HG(g2)`.
 
     **Arguments:** `g1`, `g2` as for `HenyeyGreenstein`; `weight` of the first lobe, in [0, 1]; each `()` or `(3,)`, differentiable.
     **Raises** `ValueError` otherwise.
@@ -208,7 +209,7 @@ class DoubleHenyeyGreenstein(AbstractPhase):
 
 
 class Schlick(AbstractPhase):
-    """`p = (1 - k^2) / (4 pi (1 - k cos theta)^2)` (Blasi, Le Saec and Schlick 1993), which needs no square root.
+    """Schlick's phase function, `p = (1 - k^2) / (4 pi (1 - k cos theta)^2)` (Blasi, Le Saec and Schlick 1993), which needs no square root.
 
     It resembles Henyey-Greenstein for `k = 1.55 g - 0.55 g^3` (Pharr and Humphreys 2004).
     **Arguments:** `k`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either, forward for `k > 0`; differentiable.

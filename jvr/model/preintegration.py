@@ -63,7 +63,7 @@ class SegmentMeans(NamedTuple):
 
 
 class PreIntegratedTable(AbstractTransfer):
-    """A table with the means over its blocks of intervals, ready for `segment`. Made once, outside of a march's loop.
+    """A table with the means over its blocks of intervals, ready for `evaluate_segment`. Made once, outside of a march's loop.
 
     **Arguments:** `table`: `LinearTransfer` or `LutTransfer`; `parts`: how many equal parts of a segment its self-attenuation takes
     apart, a rule of order 4. Extinction, and emission without attenuation, are exact whatever `parts`.

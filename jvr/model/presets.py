@@ -1,4 +1,4 @@
-"""First pictures of one's own scan: a ramp by window and level, presets for CT in Hounsfield units, for scans whose values have no unit,
+"""Transfer function presets: a ramp by window and level, presets for CT in Hounsfield units, for scans whose values have no unit,
 and for labels.
 
 Extinctions are per millimetre, the unit of the world in every medical format.

@@ -17,7 +17,7 @@ from jvr.types import ArrayLike, Vector
 
 
 class Scene(eqx.Module):
-    """What is rendered. A part that is `None` leaves no trace in the compiled program.
+    """A volume with transfer function, optical model and lighting. A part that is `None` leaves no trace in the compiled program.
 
     **Arguments:**
 

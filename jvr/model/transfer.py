@@ -70,7 +70,7 @@ class AbstractTable(AbstractTransfer):
 
 
 class LinearTransfer(AbstractTable):
-    """Piecewise linear between control points, constant beyond the first and the last.
+    """A piecewise linear transfer function: linear between control points, constant beyond the first and the last.
 
     **Arguments:** `positions`: `(n,)`, strictly increasing, in the data's units; `rgb`: `(n, 3)`, linear; `sigma_t`: `(n,)`, or
     `(n, 3)` for coloured extinction, per world length, not negative. All differentiable, positions too.
@@ -108,7 +108,7 @@ class LinearTransfer(AbstractTable):
 
 
 class LutTransfer(AbstractTable):
-    """A table with equally spaced entries: entries 0 and n-1 sit at the ends of `domain`, values clamp outside of it.
+    """A lookup table with equally spaced entries: entries 0 and n-1 sit at the ends of `domain`, values clamp outside of it.
 
     **Arguments:** `rgb`: `(n, 3)`; `sigma_t`: `(n,)` or `(n, 3)`; `domain`: `(low, high)` in the data's units. All
     differentiable. **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
@@ -146,7 +146,7 @@ class LutTransfer(AbstractTable):
 
 
 class GaussianTransfer(AbstractTransfer):
-    """A sum of Gaussians: `sigma_t(s) = sum_g height_g exp(-(s - center_g)^2 / (2 width_g^2))`, and as colour the mean of the
+    """A sum of Gaussians, `sigma_t(s) = sum_g height_g exp(-(s - center_g)^2 / (2 width_g^2))`, and as colour the mean of the
     Gaussians' colours, each weighted by its (mean) extinction. The weights are a softmax, so the colour stays defined where
     every Gaussian underflows. Where all heights are zero the weights do not depend on them: then the derivative in a height has
     the mean colour instead of its Gaussian's own.

@@ -1,5 +1,5 @@
-"""Pictures from samples that are far apart where a volume allows it, along the view and across it (Kraus, Strengert, Klein and Ertl,
-"Adaptive sampling in three dimensions for volume rendering on GPUs"; `jvr.march.slices` is the loop)."""
+"""Adaptive sampling: pictures from samples that are far apart where a volume allows it, along the view and across it (Kraus, Strengert,
+Klein and Ertl, "Adaptive sampling in three dimensions for volume rendering on GPUs"; `jvr.march.slices` is the loop)."""
 
 from typing import Any
 

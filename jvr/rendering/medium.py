@@ -1,4 +1,4 @@
-"""What rays march through for a scene: what the scene does not name is not in it.
+"""From a scene to the medium that rays march through: what the scene does not name is not in it.
 
 Modules of effects are imported here and only for scenes that hold them; everything else about them is behind the interfaces of
 `jvr.model.effects`.

@@ -1,4 +1,4 @@
-"""Rays through points of the image plane that are no pixel centres, inside of the picture and around it."""
+"""The image plane: rays through points of it that are no pixel centres, inside of the picture and around it."""
 
 import dataclasses
 from typing import NamedTuple

@@ -46,7 +46,7 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What a rendering compiles to. Equal plans compile to the same program; `print` explains it."""
+    """The plan of a rendering: what it compiles to. Equal plans compile to the same program; `print` explains it."""
 
     parts: tuple[Part, ...]
     key: str

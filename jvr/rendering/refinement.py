@@ -1,4 +1,4 @@
-"""Pictures from rays that are far apart where the picture is smooth.
+"""Progressive refinement: pictures from rays that are far apart where the picture is smooth.
 
 Pixels are visited on grids whose spacing is halved from one to the next. A pixel between those of the grid before is predicted by
 bilinear interpolation. All pixels of the first two grids are traced, after that only those next to one whose prediction was wrong by

@@ -1,4 +1,4 @@
-"""The rays of a picture: from the camera into the volume, through it, and what they have gathered as colours."""
+"""Camera rays: from the camera into the volume, through it, and what they have gathered as colours."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""The cheapest settings that a scene needs for a wanted accuracy, or the most accurate ones for a wanted time."""
+"""Tuning: the cheapest settings that a scene needs for a wanted accuracy, or the most accurate ones for a wanted time."""
 
 import dataclasses
 from typing import Any
@@ -21,8 +21,9 @@ MOST_TRIES = 3
 
 @dataclasses.dataclass(frozen=True)
 class Tuned:
-    """`settings`: those chosen; `predicted`: error and seconds as a smaller picture foretold them; `measured`: of the whole picture;
-    `met`: whether what was asked for holds in the measurement; `candidates`: what was measured on the smaller picture."""
+    """What `jvr.tune` found. `settings`: those chosen; `predicted`: error and seconds as a smaller picture foretold them; `measured`: of
+    the whole picture; `met`: whether what was asked for holds in the measurement; `candidates`: what was measured on the smaller
+    picture."""
 
     settings: Settings
     predicted: Measurement
