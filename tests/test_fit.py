@@ -183,7 +183,7 @@ def test_unknowns_are_told_apart_by_their_place():
     chosen = choose_unknowns(ExposedModel(scene, None), lambda m: pick(m.scene))
     # Dictionaries are flattened in the order of their keys.
     assert chosen.names == ("scene.transfer.domain", "scene.transfer.rgb", "scene.transfer.sigma_t")
-    assert len(set(chosen.places)) == 3
+    assert len(set(chosen.indices)) == 3
     result = fit(scene, unknowns=pick, max_steps=1)
     assert result.unknowns == ("transfer.domain", "transfer.rgb", "transfer.sigma_t")
     np.testing.assert_array_equal(result.errors_by_name["transfer.sigma_t"], result.standard_errors["sigma_t"])

@@ -191,7 +191,7 @@ def _swept(
     blocks = -(-layers // together)
     of_all = jax.tree.map(lambda x: jnp.tile(x, together * samples), rays)
 
-    # Checkpointed: the way back computes a block of layers again rather than keep all of its voxels.
+    # Checkpointed: the reverse pass computes a block of layers again rather than keep all of its voxels.
     @jax.checkpoint
     def sweep(tau: Channels, block: Array) -> tuple[Channels, Channels]:
         steps = block * together * samples + jnp.arange(together * samples, dtype=u.dtype)

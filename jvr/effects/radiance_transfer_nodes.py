@@ -187,7 +187,7 @@ def _carried(
             colour = tuple(c - T * jnp.expm1(-d) * e for c, T, d, e in zip(colour, before, thick, rgb, strict=True))
         return tuple(t + d for t, d in zip(tau, dtau, strict=True)), colour
 
-    # Checkpointed: the way back computes a step again rather than keep all of its voxels.
+    # Checkpointed: the reverse pass computes a step again rather than keep all of its voxels.
     @jax.checkpoint
     def step(state: tuple[Channels, Channels], ends: tuple[Numbers, Numbers]) -> tuple[tuple[Channels, Channels], None]:
         alive = (ends[0] < rays.t_out) & (ends[1] > rays.t_in) & (_least(state[0]) < opaque)

@@ -333,8 +333,8 @@ def adjoint_of(problem: Problem) -> AbstractAdjoint:
 
 
 class _Kinds(NamedTuple):
-    """Places of the unknowns in the vector of all by how they act: as `entries` of a table (rows), after the march (`outer`), or inside
-    it (`inner`). `directions`: places in `inner` that are moved together, one for each channel of the picture."""
+    """Indices of the unknowns in the vector of all by how they act: as `entries` of a table (rows), after the march (`outer`), or inside
+    it (`inner`). `directions`: indices in `inner` that are moved together, one for each channel of the picture."""
 
     problem: Problem
     entries: dict[str, np.ndarray]
@@ -349,14 +349,14 @@ class _Kinds(NamedTuple):
         begin, taken = 0, 0
         with_rows = has_rows(problem.model.scene)
         for name, array in zip(problem.unknowns.names, problem.unknowns.values(problem.model), strict=True):
-            places = np.arange(begin, begin + array.size)
+            indices = np.arange(begin, begin + array.size)
             begin += array.size
             if with_rows and name in ("scene.transfer.rgb", "scene.transfer.sigma_t"):
-                entries[name] = places.reshape(array.shape)
+                entries[name] = indices.reshape(array.shape)
             elif name in ("scene.background", "exposure"):
-                outer.append(places)
+                outer.append(indices)
             else:
-                inner.append(places)
+                inner.append(indices)
                 own = taken + np.arange(array.size)
                 taken += array.size
                 # A colour of environment lighting is seen in that colour alone: one march for all three.
@@ -370,11 +370,11 @@ class _Kinds(NamedTuple):
         np.put_along_axis(vectors, self.directions, 1.0, axis=1)
         return jnp.asarray(vectors, dtype)
 
-    def changed(self, part: Array, values: Float[Array, "unknowns"], places: np.ndarray | None = None) -> ExposedModel:
-        """The model of `values` with `part` in some places, by default those of `inner`. Arrays that hold none of them do not depend on
+    def changed(self, part: Array, values: Float[Array, "unknowns"], indices: np.ndarray | None = None) -> ExposedModel:
+        """The model of `values` with `part` at some indices, by default those of `inner`. Arrays that hold none of them do not depend on
         `part`."""
         unknowns, model = self.problem.unknowns, self.problem.model
-        where = {int(k): i for i, k in enumerate(self.inner if places is None else places)}
+        where = {int(k): i for i, k in enumerate(self.inner if indices is None else indices)}
         arrays, begin = [], 0
         for array in unknowns.split(values, model):
             first = where.get(begin)

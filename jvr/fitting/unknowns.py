@@ -23,21 +23,21 @@ class ExposedModel(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """The unknown arrays of a model, by their place in its list of leaves, with a bijector for each."""
+    """The unknown arrays of a model, by their index in its list of leaves, with a bijector for each."""
 
-    places: tuple[int, ...] = eqx.field(static=True)
+    indices: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     bijectors: tuple[AbstractBijector, ...]
 
     def values(self, model: ExposedModel) -> list[Float[Array, "..."]]:
         """The unknown arrays, each with its own shape."""
         leaves = jax.tree.leaves(model)
-        return [leaves[i] for i in self.places]
+        return [leaves[i] for i in self.indices]
 
     def insert(self, model: ExposedModel, values: list[Float[Array, "..."]]) -> ExposedModel:
         """The model with other values in place of its unknown arrays."""
         leaves, structure = jax.tree.flatten(model)
-        for i, value in zip(self.places, values, strict=True):
+        for i, value in zip(self.indices, values, strict=True):
             leaves[i] = value.reshape(leaves[i].shape).astype(leaves[i].dtype)
         return jax.tree.unflatten(structure, leaves)
 
@@ -84,19 +84,19 @@ def choose_unknowns(
     **Raises** `ValueError` where an array is not one of the scene's, not floating point, named twice or outside of its range, or the
     number of transforms differs.
     """
-    places = _places(model, select)
+    indices = _indices(model, select)
     leaves = jax.tree_util.tree_leaves_with_path(model)
     named = [(_name(path), leaf) for path, leaf in leaves]
-    for name, array in (named[i] for i in places):
+    for name, array in (named[i] for i in indices):
         if not eqx.is_inexact_array(array):
             raise ValueError(
                 f"{name.removeprefix('scene.')} has integer voxels, which cannot be fitted: convert them to floating point first"
             )
-    names = tuple(named[i][0] for i in places)
-    given = (None,) * len(places) if transforms is None else tuple(transforms)
-    if len(given) != len(places):
+    names = tuple(named[i][0] for i in indices)
+    given = (None,) * len(indices) if transforms is None else tuple(transforms)
+    if len(given) != len(indices):
         raise ValueError(
-            f"there are {len(given)} transforms for {len(places)} unknown arrays ({', '.join(names)}): give one for each"
+            f"there are {len(given)} transforms for {len(indices)} unknown arrays ({', '.join(names)}): give one for each"
         )
     voxel = jnp.min(model.scene.volume.spacing)
 
@@ -105,8 +105,8 @@ def choose_unknowns(
         _check_start(_name(path).removeprefix("scene."), value, declared)
         return bijector_of(declared, value, voxel, bounds)
 
-    chosen = tuple(t or default(*leaves[i]) for t, i in zip(given, places, strict=True))
-    return Unknowns(places, names, chosen)
+    chosen = tuple(t or default(*leaves[i]) for t, i in zip(given, indices, strict=True))
+    return Unknowns(indices, names, chosen)
 
 
 def _check_start(name: str, value: Array, declared: Range) -> None:
@@ -119,23 +119,23 @@ def _check_start(name: str, value: Array, declared: Range) -> None:
         )
 
 
-def _places(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> tuple[int, ...]:
+def _indices(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> tuple[int, ...]:
     """Where in the model's list of leaves the selected arrays are.
 
     In an abstract model every leaf is an object of its own, also where two fields hold one and the same array.
     """
     leaves, structure = jax.tree.flatten(model)
-    places: list[int | None] = []
+    indices: list[int | None] = []
 
-    def note_places(*abstract: Any) -> None:
-        place = {id(leaf): i for i, leaf in enumerate(abstract)}
-        places.extend(place.get(id(array)) for array in jax.tree.leaves(select(jax.tree.unflatten(structure, abstract))))
+    def note_indices(*abstract: Any) -> None:
+        index = {id(leaf): i for i, leaf in enumerate(abstract)}
+        indices.extend(index.get(id(array)) for array in jax.tree.leaves(select(jax.tree.unflatten(structure, abstract))))
 
-    jax.eval_shape(note_places, *leaves)
-    if not places:
+    jax.eval_shape(note_indices, *leaves)
+    if not indices:
         raise ValueError("unknowns returned no array: name at least one, for example lambda s: s.transfer.rgb")
-    found = tuple(place for place in places if place is not None)
-    if len(found) < len(places):
+    found = tuple(index for index in indices if index is not None)
+    if len(found) < len(indices):
         raise ValueError(
             "unknowns must return arrays of the scene itself, for example lambda s: (s.transfer.rgb, s.transfer.sigma_t)"
         )

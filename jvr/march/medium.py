@@ -16,7 +16,7 @@ from jvr.march.steps import Point, Sample
 from jvr.model.transfer import AbstractTable, Classified
 from jvr.types import Channels, Scalar
 
-# Optical depth of a segment, and of a voxel on the way of light, beyond which denser media are lit alike: light gets about as deep into
+# Optical depth of a segment, and of a voxel on a path of light, beyond which denser media are lit alike: light gets about as deep into
 # them as the eye sees. Without it the two would be compared at distances that a position in single precision cannot tell apart.
 DENSEST = 64.0
 
@@ -106,7 +106,7 @@ def for_derivatives(medium: Medium, wanted: Medium, moved: Any = None) -> Medium
 
 
 def taking_all(medium: Medium) -> Medium:
-    """A medium in which nothing that may have a derivative is skipped, on the way of light neither."""
+    """A medium in which nothing that may have a derivative is skipped, along the paths of light neither."""
     is_occupancy = lambda x: isinstance(x, Occupancy)
     dropped = lambda x: None if is_occupancy(x) and not x.is_bounded else x
     return jax.tree.map(dropped, medium, is_leaf=is_occupancy)

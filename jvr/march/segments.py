@@ -122,7 +122,7 @@ def with_lighting(medium: Medium, batch: SegmentBatch, samples: tuple[Sample, ..
     shader, middle = medium.shader, points_at(batch.rays, batch.ray, batch.k, batch.u)
 
     def classify(sample: Sample, point: Point) -> tuple[Channels, Channels]:
-        """Extinction, and on the way back how it changes with the scalar."""
+        """Extinction, and in the reverse pass how it changes with the scalar."""
         of = lambda s: shader.classify(medium.transfer, shader.in_world(medium.transfer, sample._replace(s=s), point)).sigma_t
         return jax.jvp(of, (sample.s,), (jnp.ones_like(sample.s),)) if reverse else (of(sample.s), ())
 

@@ -124,11 +124,11 @@ def labels(count: int, *, sigma_t: float | int) -> LutTransfer:
 
 
 def _layers(
-    low: float | int, high: float | int, places: list[float], rgb: list[list[float]], sigma_t: np.ndarray
+    low: float | int, high: float | int, positions: list[float], rgb: list[list[float]], sigma_t: np.ndarray
 ) -> LinearTransfer:
     if not low < high:
         raise ValueError(f"a preset needs low < high, not {low:g} and {high:g}")
-    return LinearTransfer(low + (high - low) * np.asarray(places), rgb, sigma_t)
+    return LinearTransfer(low + (high - low) * np.asarray(positions), rgb, sigma_t)
 
 
 def _points(rows: list[tuple[float | int, ...]]) -> LinearTransfer:
