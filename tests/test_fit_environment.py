@@ -10,7 +10,7 @@ import pytest
 from scenes import compiled
 
 import jvr
-from jvr.fitting.objective import Problem, has_rows, light_tangents, march_unknowns, normal_equations, value
+from jvr.fitting.objective import Problem, has_table_jacobian, light_tangents, march_unknowns, normal_equations, value
 from jvr.fitting.observations import observe
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 
@@ -129,9 +129,9 @@ def test_colours_of_light_share_a_march(volume):
 def test_entries_act_through_a_transfer_that_is_not_frozen(volume, frozen):
     recomputed = scene(volume, radiance_transfer=TRANSFER)
     unknowns = lambda s: s.transfer.sigma_t
-    assert not has_rows(recomputed)
+    assert not has_table_jacobian(recomputed)
     assert march_unknowns(problem_of(recomputed, unknowns)[0]) == 3
-    assert has_rows(frozen)
+    assert has_table_jacobian(frozen)
     assert march_unknowns(problem_of(frozen, unknowns)[0]) == 0
 
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scenes import OBLIQUE, compiled, perspective
 
 import jvr
+from jvr.march.jacobian import table_jacobian
 from jvr.march.march import MarchOptions
 from jvr.march.occupancy import RADII, occupancy_of
-from jvr.march.rows import table_rows
 from jvr.model.bricks import bricks_of
 from jvr.rendering.trace import camera_rays, prepare
 
@@ -215,7 +215,7 @@ def test_rows_are_the_same(x64):
     def rows(skipping, of_extinctions):
         choices = jvr.Settings(0.6, skipping=skipping)
         of_camera, _ = camera_rays(scene, camera, choices, jnp.arange(30, dtype=jnp.int32), prepare(scene, choices))
-        return table_rows(MarchOptions(0.0, False), *of_camera, of_extinctions=of_extinctions)[1]
+        return table_jacobian(MarchOptions(0.0, False), *of_camera, of_extinctions=of_extinctions)[1]
 
     exact, everything, colours = (compiled(lambda o=o: rows(*o))() for o in ((False, True), (True, True), (True, False)))
     compare = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)

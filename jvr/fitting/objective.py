@@ -18,9 +18,9 @@ from jvr.fitting.losses import AbstractPrior, SquaredError
 from jvr.fitting.observations import Observations, Samples, observed_medium, prepare_in_fit
 from jvr.fitting.unknowns import ExposedModel, Unknowns
 from jvr.march.differentiation import AbstractAdjoint, Forward, Replay, Rows
+from jvr.march.jacobian import TableJacobian, table_jacobian
 from jvr.march.march import Marched, MarchOptions
 from jvr.march.medium import Medium
-from jvr.march.rows import TableRows, table_rows
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
@@ -302,7 +302,7 @@ def _jacobian(
     gathered = None
     if kinds.entries:
         dt, of_extinctions = step_length(model.scene, problem.settings), "scene.transfer.sigma_t" in kinds.entries
-        gathered, rows = table_rows(options, medium, rays, dt, of_extinctions=of_extinctions)
+        gathered, rows = table_jacobian(options, medium, rays, dt, of_extinctions=of_extinctions)
         _add_entries(problem, model, gathered, rows, rays.length, kinds.entries, blocks)
     if kinds.inner.size:
         point = (values[kinds.inner], arrays)
@@ -329,7 +329,7 @@ def adjoint_of(problem: Problem) -> AbstractAdjoint:
     """How the whole residual vector is differentiated."""
     moves_light = any(name.startswith("scene.environment") for name in problem.unknowns.names)
     known = problem.model.scene.radiance_transfer is None or not moves_light
-    return Rows() if known and has_rows(problem.model.scene) else Forward()
+    return Rows() if known and has_table_jacobian(problem.model.scene) else Forward()
 
 
 class _Kinds(NamedTuple):
@@ -347,7 +347,7 @@ class _Kinds(NamedTuple):
         entries: dict[str, np.ndarray] = {}
         outer, inner, directions = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros((0, 3), int)]
         begin, taken = 0, 0
-        with_rows = has_rows(problem.model.scene)
+        with_rows = has_table_jacobian(problem.model.scene)
         for name, array in zip(problem.unknowns.names, problem.unknowns.values(problem.model), strict=True):
             indices = np.arange(begin, begin + array.size)
             begin += array.size
@@ -383,7 +383,7 @@ class _Kinds(NamedTuple):
         return unknowns.insert(model, arrays)
 
 
-def has_rows(scene: Scene) -> bool:
+def has_table_jacobian(scene: Scene) -> bool:
     """Whether entries of the transfer function act through what a sample is classified as, and nothing else."""
     by_gradient = needs_gradient(scene) and scene.normals.follows_transfer(scene.volume)
     shade = scene.shadows is not None or (scene.radiance_transfer is not None and not scene.radiance_transfer.is_frozen)
@@ -394,7 +394,7 @@ def _add_entries(
     problem: Problem,
     model: ExposedModel,
     gathered: Marched,
-    rows: TableRows,
+    rows: TableJacobian,
     length: Float[Array, "rays"],
     entries: dict[str, np.ndarray],
     blocks: list[Blocks],

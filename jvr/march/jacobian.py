@@ -32,7 +32,7 @@ from jvr.types import Channels, Scalar
 BLOCK = 8
 
 
-class TableRows(NamedTuple):
+class TableJacobian(NamedTuple):
     """The per-ray Jacobian of a march, by rows. Each is `(rays, entries)`, for one channel of radiance or optical depth.
 
     `radiance_rgb[c]`, `radiance_sigma[c]`: of radiance channel `c` with respect to column `c` of the colours, and to the extinctions
@@ -45,19 +45,19 @@ class TableRows(NamedTuple):
     tau_sigma: tuple[Float[Array, "rays n"], ...]
 
 
-class _RowState(NamedTuple):
+class _JacobianState(NamedTuple):
     suffix: SuffixRadiance
     j: Int[Array, "rays"]
-    rows: TableRows
+    rows: TableJacobian
 
 
-def table_rows(
+def table_jacobian(
     options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar, *, of_extinctions: bool = True
-) -> tuple[Marched, TableRows]:
+) -> tuple[Marched, TableJacobian]:
     """The march of `jvr.march.march.march` and its rows with respect to the entries of `medium.transfer`, an `AbstractTable`: colours and,
     unless not `of_extinctions`, extinctions.
 
-    Distances have no rows. Memory: `rays x entries` numbers for each row that `TableRows` lists. Detached as in `march`.
+    Distances have no rows. Memory: `rays x entries` numbers for each row that `TableJacobian` lists. Detached as in `march`.
     """
     gathered, record = integrate(options, medium, rays, dt, for_replay=True)
     assert isinstance(medium.transfer, AbstractTable)
@@ -68,28 +68,28 @@ def table_rows(
     n = medium.transfer.rgb.shape[0]
     emits, absorbs = len(gathered.radiance), len(record.front)
 
-    def start(back: BackwardRays) -> _RowState:
+    def start(back: BackwardRays) -> _JacobianState:
         zero = jnp.zeros((back.steps.size, n), rays.length.dtype)
-        rows = TableRows((zero,) * emits, (zero,) * emits * of_extinctions, (zero,) * absorbs * of_extinctions)
-        return _RowState(back.empty_suffix(emits, distance=False), jnp.zeros_like(back.steps), rows)
+        rows = TableJacobian((zero,) * emits, (zero,) * emits * of_extinctions, (zero,) * absorbs * of_extinctions)
+        return _JacobianState(back.empty_suffix(emits, distance=False), jnp.zeros_like(back.steps), rows)
 
-    def alive(back: BackwardRays, state: _RowState):
+    def alive(back: BackwardRays, state: _JacobianState):
         return state.j < back.steps
 
-    def advance(back: BackwardRays, state: _RowState, _: None) -> tuple[_RowState, None]:
-        one = lambda carry, _: _row_segment(medium, dt, back, of_extinctions, *carry)
+    def advance(back: BackwardRays, state: _JacobianState, _: None) -> tuple[_JacobianState, None]:
+        one = lambda carry, _: _jacobian_segment(medium, dt, back, of_extinctions, *carry)
         (suffix, j), (u, weights) = jax.lax.scan(one, (state.suffix, state.j), length=BLOCK)
         entry = jnp.arange(n, dtype=u.dtype)
         hats = [jnp.maximum(0.0, 1.0 - jnp.abs(u[i][:, None] - entry)) for i in range(BLOCK)]
         rows = jax.tree.map(lambda row, w: row + sum(hats[i] * w[i][:, None] for i in range(BLOCK)), state.rows, weights)
-        return _RowState(suffix, j, rows), None
+        return _JacobianState(suffix, j, rows), None
 
     back = BackwardRays(active_rays(rays, dt), *record)
     rows, _ = wavefront_while(alive, advance, start, lambda state: state.rows, back, None, record.following)
     return gathered, rows
 
 
-def _row_segment(
+def _jacobian_segment(
     medium: Medium, dt: Scalar, back: BackwardRays, of_extinctions: bool, suffix: SuffixRadiance, j: Int[Array, "rays"]
 ):
     """One segment of every ray: the state before it, where its samples fall in the table, and the weights of their hats."""
@@ -123,7 +123,7 @@ def _row_segment(
     for c in range(len(dtau) * of_extinctions):
         (of_entry,) = pull(((zero,) * len(emitted), _only(nothing.tau, c)))
         tau_sigma.append(of_entry.sigma_t[c])
-    weights = TableRows(tuple(radiance_rgb), tuple(radiance_sigma) * of_extinctions, tuple(tau_sigma))
+    weights = TableJacobian(tuple(radiance_rgb), tuple(radiance_sigma) * of_extinctions, tuple(tau_sigma))
     weights = jax.tree.map(lambda w: where_known((samples,), (w,))[0], weights)
     assert isinstance(medium.transfer, AbstractTable)
     u = jax.vmap(medium.transfer.coordinate)(samples.s)
