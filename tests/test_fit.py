@@ -409,16 +409,16 @@ def test_integer_voxels_cannot_be_fitted():
         fit(labels, unknowns=lambda s: s.volume.values)
 
 
-def test_transforms_are_inverted():
+def test_bijectors_are_inverted():
     values = [
         (jvr.Softplus(2.0), [0.5, 3.0, 40.0]),
         (jvr.Sigmoid(), [0.1, 0.5, 0.99]),
         (jvr.Identity(), [-3.0, 0.0, 2.0]),
         (jvr.Ordered(0.5), [-1.0, 0.2, 7.0]),
     ]
-    for transform, expected in values:
-        np.testing.assert_allclose(transform.forward(transform.inverse(jnp.array(expected))), expected, rtol=2e-5)
-    # At the end of its range a transform has no slope: the start is moved inside.
+    for bijector, expected in values:
+        np.testing.assert_allclose(bijector.forward(bijector.inverse(jnp.array(expected))), expected, rtol=2e-5)
+    # At the end of its range a bijector has no slope: the start is moved inside.
     assert np.all(np.isfinite(jvr.Sigmoid().inverse(jnp.array([0.0, 1.0]))))
     assert np.isfinite(jvr.Softplus(1.0).inverse(jnp.array(0.0)))
 

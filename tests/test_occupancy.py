@@ -207,7 +207,7 @@ def test_gradient_where_matter_begins_is_the_same(x64):
     assert np.sum(on[:3] != 0) > 20
 
 
-def test_rows_are_the_same(x64):
+def test_the_jacobian_is_the_same(x64):
     """Those of extinctions skip nothing; those of colours, alone, what is empty."""
     volume, transfer = scene_of(np.random.default_rng(2), (9, 8, 11), float, 1.0)
     scene, camera = jvr.Scene(volume.bricked(2), transfer), perspective(volume, 6, 5)
