@@ -21,7 +21,7 @@ from benchmarks import scenes
 from benchmarks.peers.compiled import compiler
 from benchmarks.timing import median, seconds
 from jvr.execution.tiles import dealt_blocks, picture_of, pixels_of
-from jvr.rendering.trace import aim, seen
+from jvr.rendering.trace import camera_rays, prepare
 
 SOURCE = Path(__file__).with_name("march.cu")
 TERMINATION = 1e-3
@@ -33,7 +33,7 @@ class _March(ctypes.Structure):
     """`March` of the source."""
 
     _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("voxels", "table", "reach", "rays")),
+        *((name, ctypes.c_void_p) for name in ("voxels", "table", "radius", "rays")),
         *((name, ctypes.c_int * 3) for name in ("n", "bricks")),
         *((name, ctypes.c_int) for name in ("brick", "entries", "count")),
         *((name, ctypes.c_float) for name in ("low", "high", "dt", "termination")),
@@ -47,27 +47,27 @@ class HandWritten:
     def __init__(self, scene: jvr.Scene, camera: jvr.PerspectiveCamera, settings: jvr.Settings, *, device: bool):
         self.library, self.device = _compiled(device), device
         size = self.size = (camera.height, camera.width)
-        where = jax.jit(seen, static_argnums=1)(scene, settings)
+        prepared = jax.jit(prepare, static_argnums=1)(scene, settings)
         pixels = pixels_of(dealt_blocks(*size), *size)
-        aimed, _ = jax.jit(aim, static_argnums=2)(scene, camera, settings, pixels, where)
+        of_camera, _ = jax.jit(camera_rays, static_argnums=2)(scene, camera, settings, pixels, prepared)
         assert isinstance(scene.transfer, jvr.LutTransfer)
-        assert where.occupancy is not None
+        assert prepared.occupancy is not None
         table = jnp.concatenate([scene.transfer.rgb, scene.transfer.sigma_t[:, None]], axis=1)
-        rays = jnp.stack([*aimed.rays.entry, *aimed.rays.direction, aimed.rays.length])
+        rays = jnp.stack([*of_camera.rays.entry, *of_camera.rays.direction, of_camera.rays.length])
         low, high = np.asarray(scene.transfer.domain)
-        kinds = {"voxels": np.float32, "table": np.float32, "reach": np.uint8, "rays": np.float32}
-        found = (scene.volume.values, table, where.occupancy.reach, rays)
+        kinds = {"voxels": np.float32, "table": np.float32, "radius": np.uint8, "rays": np.float32}
+        found = (scene.volume.values, table, prepared.occupancy.empty_radius, rays)
         self.arrays = {name: np.ascontiguousarray(x, kind) for (name, kind), x in zip(kinds.items(), found, strict=True)}
-        shapes = {"n": scene.volume.shape, "bricks": where.occupancy.reach.shape}
+        shapes = {"n": scene.volume.shape, "bricks": prepared.occupancy.empty_radius.shape}
         self.march = _March(
             **{name: x.ctypes.data for name, x in self.arrays.items()},
             **{name: (ctypes.c_int * 3)(*shape) for name, shape in shapes.items()},
-            brick=where.occupancy.size,
+            brick=prepared.occupancy.size,
             entries=table.shape[0],
             count=rays.shape[1],
             low=low,
             high=high,
-            dt=float(aimed.dt),
+            dt=float(of_camera.dt),
             termination=settings.termination,
         )
         self.out = np.zeros((rays.shape[1], 4), np.float32)

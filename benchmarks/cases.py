@@ -76,7 +76,7 @@ def gradient() -> dict[str, Any]:
 
 
 def skipping() -> dict[str, Any]:
-    """The CT of a torso through presets whose first position lies above air, at 192^2: everything over what leaps over empty bricks, for
+    """The CT of a torso through presets whose first position lies above air, at 192^2: everything over what skips empty bricks, for
     pictures and for gradients in voxels, colours and extinctions."""
     path = Path(os.environ.get("JVR_DATA", "data")) / "ct_torso" / "example_ct.nii.gz"
     if not path.exists():
@@ -156,7 +156,7 @@ def memory() -> dict[str, Any]:
 def fitting() -> dict[str, Any]:
     """The CT head protocol (docs/fitting.md): time to 60 dB in evaluations of a plain forward march over the same kept samples."""
     from experiments.protocols import ct_head
-    from jvr.fitting.observations import keep_samples, observe, observed_medium, seen_in_fit
+    from jvr.fitting.observations import keep_samples, observe, observed_medium, prepare_in_fit
 
     protocol = ct_head()
     if protocol is None:
@@ -166,7 +166,7 @@ def fitting() -> dict[str, Any]:
     observations = observe(start, cameras, images, None, settings).dealt(chunk)
     kept = keep_samples(start, observations, settings, chunk, 2**31, clamped=True)
     assert kept is not None
-    through, rays = observed_medium(start, kept[1], kept[0], settings, seen_in_fit(start, settings, False))
+    through, rays = observed_medium(start, kept[1], kept[0], settings, prepare_in_fit(start, settings, False))
     plain = jax.jit(yardsticks.kept_march)
     dt = step_length(start, settings)
     jax.block_until_ready(plain(through, rays, dt))

@@ -1,4 +1,4 @@
-// The march of `jvr` as one writes it by hand for a graphics card: a thread for each ray, the same samples, leaps and end of a ray.
+// The march of `jvr` as one writes it by hand for a graphics card: a thread for each ray, the same samples, skips and end of a ray.
 // Without a CUDA compiler the same function runs on the host, so that what it computes can be tested anywhere.
 
 #include <cmath>
@@ -12,12 +12,12 @@
 #endif
 
 // Pointers all belong to the host, or all to the device. Voxels and bricks in the order of (x, y, z), z fastest; `table` has four numbers
-// an entry: red, green, blue, extinction; `reach` is that of `jvr.march.occupancy.Occupancy`; `rays` has seven rows of `count` numbers:
+// an entry: red, green, blue, extinction; `radius` is the `empty_radius` of `jvr.march.occupancy.Occupancy`; `rays` has seven rows of `count` numbers:
 // entry, direction, length.
 struct March {
     const float* voxels;
     const float* table;
-    const uint8_t* reach;
+    const uint8_t* radius;
     const float* rays;
     int n[3], bricks[3];
     int brick, entries, count;
@@ -44,19 +44,19 @@ BOTH inline float sample(const March& m, const float* p) {
 }
 
 // Segments to go on from distance `u`, 0 where there may be something to see.
-BOTH inline int leap(const March& m, const float* entry, const float* along, float u) {
+BOTH inline int empty_segments(const March& m, const float* entry, const float* along, float u) {
     int brick[3];
     float p[3];
     for (int axis = 0; axis < 3; axis++) {
         p[axis] = entry[axis] + u * along[axis];
         brick[axis] = int(at_most(at_least(floorf(p[axis] / m.brick), 0.0f), float(m.bricks[axis] - 1)));
     }
-    const int reach = m.reach[(size_t(brick[0]) * m.bricks[1] + brick[1]) * m.bricks[2] + brick[2]];
-    if (reach == 0) return 0;
+    const int radius = m.radius[(size_t(brick[0]) * m.bricks[1] + brick[1]) * m.bricks[2] + brick[2]];
+    if (radius == 0) return 0;
     float distance = 1e30f;
     for (int axis = 0; axis < 3; axis++) {
         if (along[axis] == 0) continue;
-        const int face = (along[axis] > 0 ? brick[axis] + reach : brick[axis] + 1 - reach) * m.brick;
+        const int face = (along[axis] > 0 ? brick[axis] + radius : brick[axis] + 1 - radius) * m.brick;
         distance = at_most(distance, (face - p[axis]) / along[axis]);
     }
     return int(at_most(at_least(ceilf(distance / m.dt - 1e-3f), 1.0f), 1e9f));
@@ -76,7 +76,7 @@ BOTH inline int trace(const March& m, int i, float* out) {
     int samples = 0;
     for (int k = 0; k < segments && clear > m.termination;) {
         const float extent = k < segments - 1 ? m.dt : length - k * m.dt, u = k * m.dt + extent / 2;
-        if (const int skip = leap(m, entry, along, u)) {
+        if (const int skip = empty_segments(m, entry, along, u)) {
             k += skip;
             continue;
         }
@@ -121,7 +121,7 @@ extern "C" int march_on_device(const March* host, float* out, float* millisecond
         void* to;
     } copies[] = {{host->voxels, voxels, nullptr},
                   {host->table, sizeof(float) * 4 * m.entries, nullptr},
-                  {host->reach, bricks, nullptr},
+                  {host->radius, bricks, nullptr},
                   {host->rays, sizeof(float) * 7 * size_t(m.count), nullptr}};
     cudaError_t error = cudaSuccess;
     for (auto& copy : copies) {
@@ -132,7 +132,7 @@ extern "C" int march_on_device(const March* host, float* out, float* millisecond
     if (!error) error = cudaMalloc((void**)&pixels_there, pixels);
     m.voxels = (const float*)copies[0].to;
     m.table = (const float*)copies[1].to;
-    m.reach = (const uint8_t*)copies[2].to;
+    m.radius = (const uint8_t*)copies[2].to;
     m.rays = (const float*)copies[3].to;
     cudaEvent_t begin, end;
     cudaEventCreate(&begin);

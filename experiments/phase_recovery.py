@@ -29,8 +29,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jvr
 from experiments.accuracy_vs_time import machine
-from jvr.fitting.identifiability import determination
-from jvr.fitting.unknowns import Exposed, Unknowns, choose_unknowns
+from jvr.fitting.identifiability import identifiability
+from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns
 from jvr.io.config import Config, build_fit, build_scene, read_config
 
 CONFIG = Path(__file__).parents[1] / "configs" / "phase_recovery.toml"
@@ -65,9 +65,9 @@ class View(NamedTuple):
 
 
 class Residuals(eqx.Module):
-    """Rendered minus target of every view, as Optimistix calls it: a function of what the views share, on the real line."""
+    """Rendered minus target of every view, as Optimistix calls it: a function of what the views share, in unconstrained space."""
 
-    start: Exposed
+    start: ExposedModel
     unknowns: Unknowns
     views: View
     settings: jvr.Settings
@@ -78,8 +78,8 @@ class Residuals(eqx.Module):
         # One program for all views.
         return jnp.ravel(jax.lax.map(of_view, self.views))
 
-    def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
-        return self.of_values(self.unknowns.values_from_real(real, self.start)), None
+    def __call__(self, unconstrained: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
+        return self.of_values(self.unknowns.values_from_unconstrained(unconstrained, self.start)), None
 
 
 class Found(NamedTuple):
@@ -118,37 +118,37 @@ def under_moving_light(config: Config, steps: int = 30) -> tuple[Found, View]:
     stacked = [View(c, jnp.asarray(t), jnp.asarray(i)) for c, t, i in zip(job.cameras, turns, images, strict=True)]
     views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked)
 
-    start = Exposed(job.scene, None)
+    start = ExposedModel(job.scene, None)
     chosen = choose_unknowns(start, lambda m: job.keywords["unknowns"](m.scene))
     residuals = Residuals(start, chosen, views, settings)
     began = time.perf_counter()
-    path = minimised(residuals, chosen.real_from_model(start), steps)
-    values = [np.asarray(chosen.values_from_real(real, start)) for real in path]
+    path = minimised(residuals, chosen.unconstrained_from_model(start), steps)
+    values = [np.asarray(chosen.values_from_unconstrained(unconstrained, start)) for unconstrained in path]
     jacobian = np.asarray(_jacobian(residuals, jnp.asarray(values[-1])), np.float64)
     r = np.asarray(residuals_at(residuals, jnp.asarray(values[-1])), np.float64)
-    known = determination(jacobian.T @ jacobian, float(r @ r), r.size)
+    known = identifiability(jacobian.T @ jacobian, float(r @ r), r.size)
     seconds = time.perf_counter() - began
     return Found(_labels(chosen, start), np.stack(values), known.standard_errors, len(path) - 1, seconds, known.rank), views
 
 
-def minimised(residuals: Residuals, real: Float[Array, "unknowns"], steps: int) -> list[Array]:
+def minimised(residuals: Residuals, unconstrained: Float[Array, "unknowns"], steps: int) -> list[Array]:
     """The accepted points of Levenberg-Marquardt, one for each step."""
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5)
-    shape, aux = eqx.filter_eval_shape(residuals, real, None)
-    state, path = solver.init(residuals, real, None, {}, shape, aux, frozenset()), [real]
+    shape, aux = eqx.filter_eval_shape(residuals, unconstrained, None)
+    state, path = solver.init(residuals, unconstrained, None, {}, shape, aux, frozenset()), [unconstrained]
     for _ in range(steps):
-        real, state, done = _step(solver, residuals, real, state)
-        path.append(real)
+        unconstrained, state, done = _step(solver, residuals, unconstrained, state)
+        path.append(unconstrained)
         if done:
             break
     return path
 
 
 @eqx.filter_jit
-def _step(solver: Any, residuals: Residuals, real: Array, state: Any) -> tuple[Array, Any, Array]:
-    real, state, _ = solver.step(residuals, real, None, {}, state, frozenset())
-    done, _ = solver.terminate(residuals, real, None, {}, state, frozenset())
-    return real, state, done
+def _step(solver: Any, residuals: Residuals, unconstrained: Array, state: Any) -> tuple[Array, Any, Array]:
+    unconstrained, state, _ = solver.step(residuals, unconstrained, None, {}, state, frozenset())
+    done, _ = solver.terminate(residuals, unconstrained, None, {}, state, frozenset())
+    return unconstrained, state, done
 
 
 @eqx.filter_jit
@@ -165,14 +165,14 @@ def light_at_rest(config: Config) -> Found:
     """The fit with one light for all views, by `jvr.fit`."""
     job = build_fit(config)
     result = jvr.fit(job.scene, job.cameras, noisy(job.targets, seed=2), **job.keywords)
-    chosen = choose_unknowns(Exposed(job.scene, None), lambda m: job.keywords["unknowns"](m.scene))
+    chosen = choose_unknowns(ExposedModel(job.scene, None), lambda m: job.keywords["unknowns"](m.scene))
     values = [np.concatenate([np.ravel(a) for a in job.keywords["unknowns"](s)]) for s in (job.scene, result.scene)]
     errors = np.concatenate([np.ravel(e) for e in result.errors_by_name.values()])
-    names, stats = _labels(chosen, Exposed(job.scene, None)), result.stats
+    names, stats = _labels(chosen, ExposedModel(job.scene, None)), result.stats
     return Found(names, np.stack(values), errors, len(result.history), stats.seconds, stats.rank)
 
 
-def _labels(chosen: Unknowns, model: Exposed) -> list[str]:
+def _labels(chosen: Unknowns, model: ExposedModel) -> list[str]:
     """A name for each number."""
     found = []
     for name, array in zip(chosen.names, chosen.values(model), strict=True):

@@ -28,7 +28,7 @@ import jvr
 from benchmarks.peers import ours, scenes
 from benchmarks.timing import median, seconds
 from experiments.accuracy_vs_time import machine
-from jvr.effects.transfer_grid import projected_of
+from jvr.effects.radiance_transfer_grid import projected_of
 from jvr.model.harmonics.projection import map_directions
 
 DEFAULT: dict[str, Any] = {"order": 3, "rays": 64, "resolution": 1 / 3}

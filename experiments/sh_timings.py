@@ -23,7 +23,7 @@ from benchmarks.peers import ours, scenes
 from benchmarks.timing import median, ratio, seconds
 from experiments.accuracy_vs_time import machine
 from experiments.sh_accuracy import sky
-from jvr.effects.transfer_grid import TransferProjection, projected_of
+from jvr.effects.radiance_transfer_grid import RadianceTransferProjection, projected_of
 from jvr.rendering.medium import absorbing, occupancy
 
 SIZES = ((128, 128, 128), (256, 256, 128), (256, 256, 256))
@@ -94,12 +94,12 @@ def measured(shape: tuple[int, int, int], size: int, repeats: int) -> dict[str, 
 
 def _samples(scene: jvr.Scene, camera: jvr.PerspectiveCamera, unlit: jvr.Scene) -> dict[str, Any]:
     """How many samples the projection takes at the most, and how long as many of the march would take."""
-    projection = TransferProjection.of(scene, absorbing(scene, occupancy(scene, jvr.Settings()), graded=False))
+    projection = RadianceTransferProjection.of(scene, absorbing(scene, occupancy(scene, jvr.Settings()), graded=False))
     nodes = int(np.sum(projection.active()))
-    steps = projection.transfer.boundaries(scene.volume.shape).size - 1
+    steps = projection.radiance_transfer.boundaries(scene.volume.shape).size - 1
     rendering = jvr.render(unlit, camera)
     rate = float(rendering.stats.samples) / median(seconds({"": lambda: jvr.render(unlit, camera).rgb}, repeats=3), "")
-    samples = nodes * projection.transfer.rays * steps
+    samples = nodes * projection.radiance_transfer.rays * steps
     return {"nodes": nodes, "samples at most": samples, "march seconds of as many": samples / rate}
 
 

@@ -189,7 +189,7 @@ def rows(quick: bool = False) -> dict[str, list[Case]]:
             cases = [base(sigma=f, shadows=shadows, label=f"depth {f:g}") for f in (0.0, 1.0, 1e4, 1e8)]
             cases += [base(**unit, lights=point(*p), shadows=shadows, label=str(p)) for p in ((2, 2.5, 3), (2.2, 2.7, 3.4))]
             found[f"{type(shadows).__name__}: optical depth 0 ... 1e8, light inside"] = cases
-    return found | natural_rows(quick)
+    return found | environment_rows(quick)
 
 
 def smooth() -> np.ndarray:
@@ -261,10 +261,10 @@ def placed_rows(quick: bool) -> dict[str, list[Case]]:
     }
 
 
-def natural(
+def under_environment(
     *, order: int = 3, transfer: Any = None, material: Any = None, light: Any = None, label: str = "", **parts: Any
 ) -> Case:
-    """The same volume under light from all around: a dim sky and, unless told, a lamp ten thousand times as bright."""
+    """The same volume under environment lighting: a dim sky and, unless told, a lamp ten thousand times as bright."""
     case = base(shadows=None, lights=(), label=label, **parts)
     if light is None:
         light = jvr.EnvironmentLight.disc([0.3, 0.5, 0.8], 2.0, 1e4, order) + jvr.EnvironmentLight.constant(1.0)
@@ -279,25 +279,29 @@ def natural(
     return case._replace(scene=scene)
 
 
-def natural_rows(quick: bool) -> dict[str, list[Case]]:
-    """Hard cases of light from all around."""
+def environment_rows(quick: bool) -> dict[str, list[Case]]:
+    """Hard cases of environment lighting."""
     depths = (1.0, 1e8) if quick else (0.0, 1e-6, 1.0, 1e2, 1e4, 1e8)
     rough = (0.05, 1.0) if quick else (0.01, 0.05, 0.2, 1.0)
     exact = lambda **settings: jvr.RadianceTransfer(3, 8, 1.0, exact=True, **settings)
     bleeds = jvr.RadianceTransfer(3, 8, 1.0, bleeding=jvr.MaterialBleeding())
     return {
-        "transfer: optical depth 0 ... 1e8, shortcut": [natural(sigma=f, label=f"{f:g}") for f in depths],
-        "transfer: optical depth 0 ... 1e8, exact": [natural(sigma=f, transfer=exact(), label=f"{f:g}") for f in depths],
+        "transfer: optical depth 0 ... 1e8, shortcut": [under_environment(sigma=f, label=f"{f:g}") for f in depths],
+        "transfer: optical depth 0 ... 1e8, exact": [
+            under_environment(sigma=f, transfer=exact(), label=f"{f:g}") for f in depths
+        ],
         "transfer: material bleeding, order 0 and 3": [
-            natural(transfer=bleeds, label="3"),
-            natural(order=0, transfer=jvr.RadianceTransfer(0, 8, 1.0), label="0"),
+            under_environment(transfer=bleeds, label="3"),
+            under_environment(order=0, transfer=jvr.RadianceTransfer(0, 8, 1.0), label="0"),
         ],
         "transfer: no gradient, all gradient": [
-            natural(values=np.full(SHAPE, 0.5), label="constant"),
-            natural(transfer=exact(surface=1e-6), label="alpha 0"),
-            natural(transfer=exact(surface=1e6), label="alpha 90 degrees"),
+            under_environment(values=np.full(SHAPE, 0.5), label="constant"),
+            under_environment(transfer=exact(surface=1e-6), label="alpha 0"),
+            under_environment(transfer=exact(surface=1e6), label="alpha 90 degrees"),
         ],
-        "microfacets: roughness 0.01 ... 1": [natural(material=jvr.MicrofacetBRDF(roughness=r), label=f"{r:g}") for r in rough],
+        "microfacets: roughness 0.01 ... 1": [
+            under_environment(material=jvr.MicrofacetBRDF(roughness=r), label=f"{r:g}") for r in rough
+        ],
     }
 
 

@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from jvr.effects.shadow_volume import OpacityShadowMap as OpacityShadowMap
     from jvr.effects.shadow_volume import ShadowVolume as ShadowVolume
     from jvr.execution.devices import use_all_cores as use_all_cores
+    from jvr.fitting.bijectors import Bounded as Bounded
+    from jvr.fitting.bijectors import Identity as Identity
+    from jvr.fitting.bijectors import Ordered as Ordered
+    from jvr.fitting.bijectors import Sigmoid as Sigmoid
+    from jvr.fitting.bijectors import Softplus as Softplus
     from jvr.fitting.fit import FitResult as FitResult
     from jvr.fitting.fit import fit as fit
     from jvr.fitting.initialise import colours_given_extinction as colours_given_extinction
@@ -33,11 +38,6 @@ if TYPE_CHECKING:
     from jvr.fitting.losses import SquaredError as SquaredError
     from jvr.fitting.minimisers import LBFGSB as LBFGSB
     from jvr.fitting.residuals import residuals as residuals
-    from jvr.fitting.transforms import Bounded as Bounded
-    from jvr.fitting.transforms import Identity as Identity
-    from jvr.fitting.transforms import Ordered as Ordered
-    from jvr.fitting.transforms import Sigmoid as Sigmoid
-    from jvr.fitting.transforms import Softplus as Softplus
     from jvr.io.images import read_image as read_image
     from jvr.io.precompute import precompute as precompute
     from jvr.io.volumes import read_volume as read_volume
@@ -150,7 +150,7 @@ _NAMES = {
     ),
     "jvr.fitting.minimisers": ("LBFGSB",),
     "jvr.fitting.residuals": ("residuals",),
-    "jvr.fitting.transforms": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
+    "jvr.fitting.bijectors": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
     "jvr.io.images": ("read_image",),
     "jvr.io.precompute": ("precompute",),
     "jvr.io.volumes": ("read_volume",),

@@ -1,4 +1,4 @@
-"""Functions with a delicate limit, and their derivatives; reads and writes that the compiler does well."""
+"""Numerical primitives: functions with a delicate limit, and their derivatives; reads and writes that the compiler does well."""
 
 from typing import TypeVar
 
@@ -63,7 +63,7 @@ def _one_minus_exp_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[A
 
 
 def mean_depth(tau: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Where the emission that leaves a homogeneous segment of optical depth `tau` comes from on average, as a share of its length:
+    """Where the emission that leaves a homogeneous segment of optical depth `tau` comes from on average, as a fraction of its length:
     `1 / tau - 1 / (exp(tau) - 1)`, from 1/2 for a thin segment towards 0 for an opaque one.
 
     For thin ones by its series, `1/2 - tau/12 + tau^3/720 - tau^5/30240`, whose terms do not cancel; behind large ones `exp` overflows.
@@ -185,13 +185,13 @@ def ray_box(origin: Triple, direction: Triple, lower: Corner, upper: Corner) -> 
     return t_near, t_far
 
 
-def computed_once(proof: Bool[Array, "..."], x: Tree) -> Tree:
-    """`x` itself, which the CPU compiler then computes once and not again in each kernel that reads it.
+def materialise(mask: Bool[Array, "..."], x: Tree) -> Tree:
+    """A fusion barrier: `x` itself, which the CPU compiler then computes once and not again in each kernel that reads it.
 
-    A conditional is the one thing that it does not fuse through (an optimization barrier does not survive it). `proof` has
+    A conditional is the one thing that it does not fuse through (an optimization barrier does not survive it). `mask` has
     an element that is true whenever `x` matters, which the compiler cannot know; where none is, zeros are returned.
     """
-    return jax.lax.cond(jnp.any(proof), lambda x: x, lambda x: jax.tree.map(jnp.zeros_like, x), x)
+    return jax.lax.cond(jnp.any(mask), lambda x: x, lambda x: jax.tree.map(jnp.zeros_like, x), x)
 
 
 def read_at(array: Shaped[Array, "n"], index: Int[Array, "..."]) -> Shaped[Array, "..."]:

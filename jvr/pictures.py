@@ -33,7 +33,7 @@ class ImageError(ValueError):
 def as_radiance(image: Any, name: str) -> np.ndarray:
     """The image as an array of floating-point numbers.
 
-    **Raises** `ValueError` for whole numbers: they are codes of a file or a screen, of which white is 255 and the middle not half of
+    **Raises** `ValueError` for integers: they are codes of a file or a screen, of which white is 255 and the middle not half of
     the light; and for what is no array of real numbers.
     """
     array = np.asarray(image)
@@ -58,7 +58,7 @@ def srgb_from_linear(linear: ArrayLike) -> Float[np.ndarray, "..."]:
 def linear_from_srgb(code: ArrayLike) -> Float[np.ndarray, "..."]:
     """Linear light of an sRGB code between 0 and 1 (IEC 61966-2-1).
 
-    **Raises** `ValueError` for whole numbers above 1: the codes of a file are divided by the largest first, 255 or 65535.
+    **Raises** `ValueError` for integers above 1: the codes of a file are divided by the largest first, 255 or 65535.
     """
     given = np.asarray(code)
     if given.dtype.kind in "iu" and given.size and given.max() > 1:
@@ -78,7 +78,7 @@ def write_image(
     clipped.
 
     The file appears under its name once it is whole; where writing fails, a file that was there before stays.
-    **Raises** `ValueError` for shapes that do not fit, whole numbers in place of radiance, another extension, and, in a PNG, a depth or
+    **Raises** `ValueError` for shapes that do not fit, integers in place of radiance, another extension, and, in a PNG, a depth or
     pixels that are not finite;
     `OSError` where the file cannot be written.
     """

@@ -161,7 +161,7 @@ def test_every_selected_element_is_worked_on_once(size, share):
 def test_a_selected_map_has_the_derivative_of_the_map(x64):
     rng = np.random.default_rng(0)
     mask, x, weights = rng.random(5000) < 0.6, rng.random(5000), rng.random(5000)
-    f = lambda shared, lanes: jnp.sin(shared * lanes[0]) * lanes[1]
+    f = lambda shared, block: jnp.sin(shared * block[0]) * block[1]
     some = lambda a, x, y: jnp.sum(weights * map_selected(f, mask, a, (x, y)))
     whole = lambda a, x, y: jnp.sum(weights * jnp.where(mask, f(a, (x, y)), 0.0))
     mask = jnp.asarray(mask)
@@ -172,11 +172,11 @@ def test_a_selected_map_has_the_derivative_of_the_map(x64):
 def test_an_envelope_is_what_is_wanted_plus_the_way_to_it():
     rng = np.random.default_rng(3)
     wanted = np.where(rng.random((7, 6, 5)) < 0.05, rng.random((7, 6, 5)), np.inf)
-    thickness, reach = (1.0, 2.0, 1.5), 4.0
+    thickness, farthest = (1.0, 2.0, 1.5), 4.0
     index = np.stack(np.meshgrid(*map(np.arange, wanted.shape), indexing="ij"), -1).reshape(-1, 3)
     slabs = np.maximum(np.abs(index[:, None] - index[None]) - 1, 0) * np.array(thickness)
-    exact = np.minimum(np.min(np.max(slabs, -1) + wanted.reshape(-1), axis=1), reach).reshape(wanted.shape)
-    found = compiled(envelope)(jnp.asarray(wanted), tuple(map(jnp.asarray, thickness)), jnp.asarray(reach))
+    exact = np.minimum(np.min(np.max(slabs, -1) + wanted.reshape(-1), axis=1), farthest).reshape(wanted.shape)
+    found = compiled(envelope)(jnp.asarray(wanted), tuple(map(jnp.asarray, thickness)), jnp.asarray(farthest))
     # Radii grow by the thinnest slab: never too far, and short by less than one of them.
     assert np.all(found <= exact + 1e-5)
     assert np.all(found > exact - 1.0)
@@ -189,12 +189,12 @@ ORACLES = (jvr.OpacityChange, jvr.BrickRange, jvr.LocalError)
 
 
 @functools.partial(compiled, static_argnums=0)
-def ask(oracle, volume, transfer, optical, reach):
-    return distance_field(oracle, volume, transfer, optical, reach)
+def ask(oracle, volume, transfer, optical, farthest):
+    return distance_field(oracle, volume, transfer, optical, farthest)
 
 
-def field(oracle, values, transfer, reach=100.0, optical=jvr.EmissionAbsorption()):
-    return np.asarray(ask(oracle, jvr.Volume(values), transfer, optical, jnp.asarray(reach)).distance)
+def field(oracle, values, transfer, farthest=100.0, optical=jvr.EmissionAbsorption()):
+    return np.asarray(ask(oracle, jvr.Volume(values), transfer, optical, jnp.asarray(farthest)).distance)
 
 
 def test_nothing_is_wanted_where_nothing_changes():
@@ -214,10 +214,10 @@ def test_everything_is_wanted_where_a_voxel_is_no_number():
 
 def test_the_distance_to_a_change_of_opacity():
     transfer = jvr.LinearTransfer([0, 1], np.ones((2, 3)), [0.0, 0.5])
-    found = field(jvr.OpacityChange(0.01), STEP, transfer, reach=5.0)
+    found = field(jvr.OpacityChange(0.01), STEP, transfer, farthest=5.0)
     # The step is in cell 11; cells next to it touch it.
     np.testing.assert_allclose(found[:, 0, 0], np.minimum(np.maximum(np.abs(np.arange(23) - 11) - 1, 0), 5))
-    assert np.all(field(jvr.OpacityChange(0.5), STEP, transfer, reach=5.0) == 5)
+    assert np.all(field(jvr.OpacityChange(0.5), STEP, transfer, farthest=5.0) == 5)
 
 
 def test_a_peak_between_the_values_of_two_voxels_is_seen():

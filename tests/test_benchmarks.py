@@ -15,7 +15,7 @@ from benchmarks.peers.compiled import compiler
 
 @pytest.mark.parametrize("transfer", [scenes.translucent(), scenes.opaque()], ids=["translucent", "opaque"])
 def test_the_march_by_hand_is_that_of_jvr(transfer):
-    """On the host, where every machine can run it: the same samples, but for those of jvr that a leap ends with in an empty brick. (A
+    """On the host, where every machine can run it: the same samples, but for those of jvr that a skip ends with in an empty brick. (A
     picture of whole blocks: beyond its border rays are marched again.)"""
     volume = scenes.gyroid(24).bricked()
     try:

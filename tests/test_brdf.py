@@ -47,7 +47,7 @@ def pseudorandom_directions(n, seed, upper=False):
 
 @eqx.filter_jit
 def furnace(brdf, degrees):
-    """The share of even light that is reflected at each of some angles to the normal: tinted and plain, summed, first component."""
+    """The share of even light that is reflected at each of some angles to the normal: tinted and unmodulated, summed, first component."""
     w_i, weight = sphere()
 
     def at(angle):
@@ -59,8 +59,8 @@ def furnace(brdf, degrees):
 
 def total(brdf, w_o, w_i):
     """All components of both parts in one array."""
-    tinted, plain = brdf.evaluate(w_o, w_i)
-    return jnp.stack([jnp.broadcast_to(c, jnp.broadcast_shapes(w_o[2].shape, w_i[2].shape)) for c in (*tinted, *plain)])
+    tinted, unmodulated = brdf.evaluate(w_o, w_i)
+    return jnp.stack([jnp.broadcast_to(c, jnp.broadcast_shapes(w_o[2].shape, w_i[2].shape)) for c in (*tinted, *unmodulated)])
 
 
 # --- Energy ----------------------------------------------------------------------------------------------------------
@@ -88,8 +88,8 @@ def test_glossy_lobes_return_all_from_above_and_never_more(x64, make, exponent):
 
 def test_exponent_0_is_lambert(x64):
     w_o, w_i = pseudorandom_directions(50, 0, upper=True), pseudorandom_directions(50, 1)
-    matte = jvr.LambertBRDF(0.4).evaluate(w_o, w_i)[0][0]
-    np.testing.assert_allclose(jvr.BlinnPhongBRDF(0.0, 0.4, 0.0).evaluate(w_o, w_i)[1][0], matte, rtol=1e-12)
+    diffuse = jvr.LambertBRDF(0.4).evaluate(w_o, w_i)[0][0]
+    np.testing.assert_allclose(jvr.BlinnPhongBRDF(0.0, 0.4, 0.0).evaluate(w_o, w_i)[1][0], diffuse, rtol=1e-12)
 
 
 @pytest.mark.parametrize("roughness", [0.3, 0.5, 0.7, 1.0])
@@ -103,13 +103,13 @@ def test_coated_white_returns_everything(x64, roughness):
 def test_white_metal_loses_what_bounces_between_mirrors(x64):
     lost = [1 - np.asarray(furnace(jvr.MicrofacetBRDF(metallic=1.0, roughness=r), ANGLES)) for r in (0.3, 0.5, 0.7, 1.0)]
     assert np.all(np.asarray(lost) > -1e-4)
-    # Single scattering of white GGX mirrors seen straight: published tables have 1 %, 8 %, 30 % and 69 %.
+    # Single scattering of white GGX microfacets seen straight: published tables have 1 %, 8 %, 30 % and 69 %.
     np.testing.assert_allclose([loss[0] for loss in lost], [0.0093, 0.084, 0.302, 0.693], atol=0.002)
 
 
 @pytest.mark.parametrize("alpha", [0.05, 0.3, 1.0])
 def test_mirrors_cover_the_surface_and_each_view_of_it(x64, alpha):
-    """The integral of D cos is 1; so is that of the mirrors seen from anywhere, `G1 max(w_o . h, 0) D / cos` (weak white furnace)."""
+    """The integral of D cos is 1; so is that of the microfacets seen from anywhere, `G1 max(w_o . h, 0) D / cos` (weak white furnace)."""
     # In the tangent over alpha, D is one rational function for every alpha; the last variable maps 0 ... 1 to all of it.
     u, weights = np.polynomial.legendre.leggauss(200)
     u, weights = 0.5 * (u + 1), 0.5 * weights
@@ -128,7 +128,7 @@ def test_mirrors_cover_the_surface_and_each_view_of_it(x64, alpha):
         np.testing.assert_allclose(np.sum(area * np.maximum(seen, 0) * masking / w_o[2]), 1.0, rtol=2e-4)
 
 
-# Smoother mirrors need a finer quadrature than the furnace's.
+# Smoother microfacets need a finer quadrature than the furnace's.
 @pytest.mark.parametrize("alpha", [0.25, 0.5, 1.0])
 def test_table_of_shares_is_the_integral(x64, alpha):
     cosine, a, b = (np.asarray(t) for t in reflectances(jnp.asarray(alpha)))
@@ -149,10 +149,10 @@ def test_roughest_mirrors_have_a_closed_form(x64):
 def test_metal_is_tinted_and_its_rim_is_not():
     metal = jvr.MicrofacetBRDF(metallic=1.0, roughness=0.4)
     share = lambda w_o, w_i: [float(part[0]) for part in metal.evaluate(w_o, w_i)]
-    tinted, plain = share(towards(10.0), towards(10.0, 180.0))
-    assert plain < 1e-3 * tinted
-    tinted, plain = share(towards(89.0), towards(89.0, 180.0))
-    assert plain > 5 * tinted
+    tinted, unmodulated = share(towards(10.0), towards(10.0, 180.0))
+    assert unmodulated < 1e-3 * tinted
+    tinted, unmodulated = share(towards(89.0), towards(89.0, 180.0))
+    assert unmodulated > 5 * tinted
 
 
 # --- Symmetry --------------------------------------------------------------------------------------------------------
@@ -185,7 +185,9 @@ def test_what_a_material_turns_with_is_true(x64, name):
     roll = lambda w: (w[2], w[0], w[1])
     same_normal = np.allclose(total(brdf, w_o, w_i), total(brdf, other, w_i))
     same_angle = np.allclose(total(brdf, w_o, w_i), total(brdf, roll(w_o), roll(w_i)))
-    assert (same_normal, same_angle) == {"normal": (True, False), "eye": (False, True), "both": (False, False)}[brdf.about]
+    assert (same_normal, same_angle) == {"normal": (True, False), "eye": (False, True), "both": (False, False)}[
+        brdf.symmetry_axis
+    ]
 
 
 @pytest.mark.parametrize("name", MADE)
@@ -194,9 +196,9 @@ def test_components_and_shapes(name):
     brdf = make(jnp.asarray(parameters))
     one = total(brdf, *(tuple(c[7] for c in pseudorandom_directions(9, s)) for s in (1, 2)))
     w_o, w_i = (tuple(c.reshape(shape) for c in pseudorandom_directions(9, s)) for s, shape in ((1, (9, 1)), (2, (1, 9))))
-    tinted, plain = brdf.evaluate(w_o, w_i)
+    tinted, unmodulated = brdf.evaluate(w_o, w_i)
     assert len(tinted) in (0, 1, 3)
-    assert len(plain) in (0, 1, 3)
+    assert len(unmodulated) in (0, 1, 3)
     np.testing.assert_allclose(total(brdf, w_o, w_i)[:, 7, 7], one, rtol=1e-5)
 
 

@@ -351,7 +351,7 @@ def test_the_compilation_cache_lies_in_the_users_cache_folder(tmp_path, monkeypa
         jax.config.update("jax_compilation_cache_dir", before)
 
 
-NATURAL = """
+ENVIRONMENT = """
 [volume]
 builtin = "demo"
 [camera]
@@ -398,7 +398,7 @@ def cached(tmp_path, monkeypatch):
     monkeypatch.setenv("JVR_CACHE", "1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-    (tmp_path / "natural.toml").write_text(NATURAL)
+    (tmp_path / "natural.toml").write_text(ENVIRONMENT)
 
 
 @pytest.mark.slow

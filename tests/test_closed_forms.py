@@ -12,7 +12,7 @@ from scenes import OBLIQUE, affine, compiled, linear_transfer, perspective, voxe
 from scenes import render_quickly as render
 
 import jvr
-from jvr.march import batch
+from jvr.march import wavefront
 
 SETTINGS = jvr.Settings(0.5, termination=0)
 COLOUR = np.array([0.9, 0.5, 0.2])
@@ -185,8 +185,8 @@ def test_error_of_early_termination_is_bounded_by_its_setting(termination):
 
 
 @pytest.mark.slow
-def test_tiles_and_the_pool_change_nothing(monkeypatch):
-    """All rays at once, against a pool of lanes that is filled again on the way and against tiles that do not divide the picture."""
+def test_tiles_and_the_wavefront_change_nothing(monkeypatch):
+    """All rays at once, against a wavefront that is filled again on the way and against tiles that do not divide the picture."""
     volume = jvr.Volume(voxels(), OBLIQUE)
     camera = perspective(volume, 24, 20)
 
@@ -195,14 +195,14 @@ def test_tiles_and_the_pool_change_nothing(monkeypatch):
         image = jvr.render(scene, camera, jvr.Settings(0.5, tile=tile))
         return jnp.sum(jnp.sin(3 * image.rgb)) + jnp.sum(image.alpha**2) + 0.1 * jnp.sum(image.depth), image
 
-    def both(pool, tile):
-        monkeypatch.setattr(batch, "POOL", pool)
+    def both(width, tile):
+        monkeypatch.setattr(wavefront, "WAVEFRONT", width)
         (_, image), gradient = compiled(jax.value_and_grad(lambda v: loss(v, tile), has_aux=True))(volume.values)
         return image, gradient
 
     whole, gradient = both(1000, 1000)
-    for pool, tile in ((100, 1000), (1000, 130)):
-        image, other = both(pool, tile)
+    for width, tile in ((100, 1000), (1000, 130)):
+        image, other = both(width, tile)
         for a, b in zip(jax.tree.leaves(image), jax.tree.leaves(whole), strict=True):
             # Programs for batches of other sizes round differently. Entry and exit are distances near 30, so that a chord is
             # good to 6e-6 and its optical depth here to 1e-5.

@@ -15,7 +15,7 @@ import jvr
 from jvr.rendering.advise import effects_of, remarks_on
 
 MODULES = ("lighting", "shading", "scattering", "shadow_rays", "shadow_volume", "shadow_map", "deep_shadow_map", "light_space")
-MODULES += ("natural_light", "radiance_transfer", "transfer_grid", "diffusion")
+MODULES += ("environment_lighting", "radiance_transfer", "radiance_transfer_grid", "diffusion")
 MODELS = ("material", "brdf", "microfacet", "merl", "dipole")
 LIGHT = {"lights": (jvr.DirectionalLight((0.3, -0.5, -1.0)), jvr.AmbientLight(0.2))}
 EFFECTS = {
@@ -24,8 +24,8 @@ EFFECTS = {
     "shadows": lambda: {"shading": jvr.Lambert(), "shadows": jvr.ShadowVolume(1.0)},
     "gradient": lambda: {"transfer": jvr.GradientOpacity(transfer(), 0.01, 0.3)},
 }
-# Light from all around in the air, on surfaces, and in the way of each other; each met once by every other effect.
-NATURAL = {
+# Environment lighting in the air, on surfaces, and in the way of each other; each met once by every other effect.
+ENVIRONMENT = {
     "haze": lambda: around(jvr.PhaseBRDF(jvr.HenyeyGreenstein(0.4), 0.9)),
     "surfaces": lambda: around(jvr.LambertBRDF(0.8)),
     "radiance_transfer": lambda: around(
@@ -40,7 +40,7 @@ def transfer(scale=0.6):
 
 
 def around(material, **parts):
-    """Parts of a scene under light from all around."""
+    """Parts of a scene under environment lighting."""
     return {"environment": jvr.EnvironmentLight.constant(0.7, order=1), "material": material, **parts}
 
 
@@ -76,10 +76,10 @@ def test_scene_without_effects_needs_none_of_their_modules():
     assert clean(run.stdout) == clean(program(scene()))
 
 
-@pytest.mark.parametrize("names", [*[(n,) for n in (*EFFECTS, *NATURAL)], *PAIRS])
+@pytest.mark.parametrize("names", [*[(n,) for n in (*EFFECTS, *ENVIRONMENT)], *PAIRS])
 def test_an_effect_is_in_the_program_only_where_the_scene_holds_it(names):
     """Plans and programs differ from the plain one by what is named; taking the effects out again restores both."""
-    parts = functools.reduce(lambda a, b: a | b, [(EFFECTS | NATURAL)[name]() for name in names], dict(LIGHT))
+    parts = functools.reduce(lambda a, b: a | b, [(EFFECTS | ENVIRONMENT)[name]() for name in names], dict(LIGHT))
     lit, plain = scene(**parts), scene()
     assert program(lit) != program(plain)
     assert jvr.plan(lit) != jvr.plan(plain)
@@ -126,7 +126,7 @@ def test_new_numbers_compile_nothing():
 
 
 @pytest.mark.slow
-def test_new_numbers_of_natural_light_compile_nothing():
+def test_new_numbers_of_environment_lighting_compile_nothing():
     """Light, material, dipole and transfer function; also once all has been computed beforehand."""
     count = []
 
@@ -135,7 +135,7 @@ def test_new_numbers_of_natural_light_compile_nothing():
         count.append(1)
         return jvr.render(one, camera).rgb
 
-    def natural(x):
+    def under_environment(x):
         bled = jvr.RadianceTransfer(1, 4, bleeding=jvr.TransferBleeding(), scattering=jvr.Dipole([x] * 3, [0.1] * 3))
         light = jvr.EnvironmentLight.constant(x, order=1).rotated(np.array([[0, x, 0], [-x, 0, 0], [0, 0, x]]) / x)
         made = around(jvr.LambertBRDF(x), radiance_transfer=bled) | {"environment": light}
@@ -145,13 +145,13 @@ def test_new_numbers_of_natural_light_compile_nothing():
 
     # What is not traced again is not compiled again.
     for x in (0.5, 0.9):
-        picture.trace(natural(x), perspective(natural(x).volume))
+        picture.trace(under_environment(x), perspective(under_environment(x).volume))
     assert len(count) == 1
     for x in (0.5, 0.9):
-        frozen = jvr.precompute(natural(x))
+        frozen = jvr.precompute(under_environment(x))
         picture.trace(frozen, perspective(frozen.volume))
     assert len(count) == 2
-    assert jvr.plan(jvr.precompute(natural(0.5))) == jvr.plan(as_precomputed(natural(0.5)))
+    assert jvr.plan(jvr.precompute(under_environment(0.5))) == jvr.plan(as_precomputed(under_environment(0.5)))
 
 
 def test_plan_says_what_effects_need():
@@ -160,7 +160,7 @@ def test_plan_says_what_effects_need():
     assert parts["shadows"].needs == ("light march",)
     assert "ShadowVolume(resolution=1) for 1 light" in parts["shadows"].reason
     assert "asked for by shading" in parts["gradient"].reason
-    parts = {p.name: p for p in jvr.plan(scene(**NATURAL["radiance_transfer"]())).parts}
+    parts = {p.name: p for p in jvr.plan(scene(**ENVIRONMENT["radiance_transfer"]())).parts}
     assert parts["material"].needs == ("environment", "gradient")
     assert "computed in each picture: jvr.precompute" in parts["radiance transfer"].reason
 

@@ -325,7 +325,7 @@ def test_narrow_spots(outer):
         light = jvr.SpotLight(p[:3], [0.0, 0.0, 2.0], 3.0, inner=0.2 * p[3], outer=p[3])
         zero = jnp.zeros_like(p[0])
         x = (zero + 0.5 * np.tan(np.deg2rad(outer)), zero, zero + 1.0)
-        return light.arrives(x, (zero, zero, zero + 1)).irradiance[0]
+        return light.sample(x, (zero, zero, zero + 1)).irradiance[0]
 
     p = np.array([0, 0, 0, outer])
     value, gradient = jax.value_and_grad(arriving)(jnp.asarray(p, jnp.float32))

@@ -13,10 +13,10 @@ from scenes import perspective
 
 import jvr
 from jvr.fitting import checkpoint
-from jvr.fitting.identifiability import determination
+from jvr.fitting.identifiability import identifiability
 from jvr.fitting.objective import Problem, normal_equations, value
 from jvr.fitting.observations import keep_samples, observe
-from jvr.fitting.unknowns import Exposed, choose_unknowns
+from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 
 SETTINGS = jvr.Settings(step=0.7, termination=0.0)
 ENTRIES = 8
@@ -99,14 +99,14 @@ def test_kept_samples_change_nothing_and_report_their_bytes():
 def test_kept_samples_are_the_samples():
     problem, observations = _problem(), observe(START, CAMERAS, IMAGES, None, SETTINGS).dealt(720)
     samples, kept = keep_samples(START, observations, SETTINGS, 720, 2**30, clamped=True)
-    values = problem.unknowns.values_from_real(problem.unknowns.real_from_model(problem.model), problem.model)
+    values = problem.unknowns.values_from_unconstrained(problem.unknowns.unconstrained_from_model(problem.model), problem.model)
     direct = normal_equations(problem, values, observations)
     stored = normal_equations(problem.with_samples(samples), values, kept)
     np.testing.assert_allclose(stored.matrix, direct.matrix, rtol=1e-3, atol=1e-4 * np.abs(direct.matrix).max())
 
 
 def _problem(loss=None, exposure=None, unknowns=both) -> Problem:
-    model = Exposed(TRUTH, exposure)
+    model = ExposedModel(TRUTH, exposure)
     chosen = choose_unknowns(model, lambda m: (unknowns(m.scene), m.exposure))
     return Problem(model, chosen, SETTINGS, loss or jvr.SquaredError(), (), None)
 
@@ -124,16 +124,16 @@ def test_normal_equations_have_the_gradient_of_the_objective(loss, names, x64):
     if names == "coloured":
         coloured = scene.transfer.sigma_t[:, None] * jnp.array([1.0, 0.7, 1.3])
         scene = eqx.tree_at(lambda s: s.transfer.sigma_t, scene, coloured)
-    model = Exposed(scene, jnp.ones(()) * 1.1 if names == "everything" else None)
+    model = ExposedModel(scene, jnp.ones(()) * 1.1 if names == "everything" else None)
     pick = lambda s: (*both(s), s.background, s.transfer.domain) if names == "everything" else both(s)
     unknowns = choose_unknowns(model, lambda m: (pick(m.scene), m.exposure))
-    unknowns = eqx.tree_at(lambda u: u.transforms, unknowns, (jvr.Identity(),) * len(unknowns.transforms))
+    unknowns = eqx.tree_at(lambda u: u.bijectors, unknowns, (jvr.Identity(),) * len(unknowns.bijectors))
     problem = Problem(model, unknowns, SETTINGS, loss, (), None)
     observations = observe(scene, CAMERAS, [0.8 * image for image in IMAGES], None, SETTINGS).dealt(720)
-    values = unknowns.real_from_model(model)
+    values = unknowns.unconstrained_from_model(model)
     normal = normal_equations(problem, values, observations)
-    pieces = jax.tree.map(lambda x: x[None], observations)
-    objective, gradient = jax.value_and_grad(lambda v: value(problem, v, pieces, jnp.ones(())))(values)
+    tiles = jax.tree.map(lambda x: x[None], observations)
+    objective, gradient = jax.value_and_grad(lambda v: value(problem, v, tiles, jnp.ones(())))(values)
     np.testing.assert_allclose(normal.loss, objective, rtol=1e-10)
     np.testing.assert_allclose(2 * normal.vector, gradient, rtol=1e-7, atol=1e-9 * np.abs(gradient).max())
 
@@ -180,10 +180,10 @@ def test_unknowns_are_told_apart_by_their_place():
     scene = eqx.tree_at(lambda s: (s.transfer.rgb, s.transfer.sigma_t), TRUTH, (table, table))
     assert scene.transfer.rgb is scene.transfer.sigma_t
     pick = lambda s: {"sigma_t": s.transfer.sigma_t, "more": (s.transfer.domain, s.transfer.rgb)}
-    chosen = choose_unknowns(Exposed(scene, None), lambda m: pick(m.scene))
+    chosen = choose_unknowns(ExposedModel(scene, None), lambda m: pick(m.scene))
     # Dictionaries are flattened in the order of their keys.
     assert chosen.names == ("scene.transfer.domain", "scene.transfer.rgb", "scene.transfer.sigma_t")
-    assert len(set(chosen.places)) == 3
+    assert len(set(chosen.indices)) == 3
     result = fit(scene, unknowns=pick, max_steps=1)
     assert result.unknowns == ("transfer.domain", "transfer.rgb", "transfer.sigma_t")
     np.testing.assert_array_equal(result.errors_by_name["transfer.sigma_t"], result.standard_errors["sigma_t"])
@@ -249,12 +249,12 @@ def test_standard_errors_cover_the_truth():
 def test_determination_of_a_known_matrix():
     rows = np.random.default_rng(0).normal(size=(500, 4))
     rows[:, 3] = rows[:, 0] + rows[:, 1]
-    known = determination(rows.T @ rows, squares=5.0, measurements=500)
+    known = identifiability(rows.T @ rows, squares=5.0, measurements=500)
     assert known.rank == 3
     assert np.all(np.isinf(known.standard_errors[[0, 1, 3]]))
     alone = np.sqrt(5.0 / 497 * np.linalg.pinv(rows.T @ rows)[2, 2])
     assert known.standard_errors[2] == pytest.approx(alone, rel=1e-6)
-    assert known.worst[2] == pytest.approx(0, abs=1e-6)
+    assert known.least_determined[2] == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("angle", "determined"), [(1.0, True), (3e-2, True), (1e-3, True), (1e-6, False)])
@@ -264,7 +264,7 @@ def test_nearly_parallel_columns_are_told_apart_down_to_the_rounding_of_float32(
     columns[:, 4] = np.cos(angle) * columns[:, 3] + np.sin(angle) * columns[:, 4]
     columns[:, 0] *= 1e-3
     rounded = columns.astype(np.float32).astype(np.float64)
-    known = determination(rounded.T @ rounded, squares=3.0, measurements=3000)
+    known = identifiability(rounded.T @ rounded, squares=3.0, measurements=3000)
     exact = np.sqrt(3.0 / (3000 - known.rank) * np.diag(np.linalg.inv(columns.T @ columns)))
     assert known.rank == (5 if determined else 4)
     # Rounding turns a column by 3e-8, which is 3e-5 of the smallest angle that is determined.
@@ -409,16 +409,16 @@ def test_integer_voxels_cannot_be_fitted():
         fit(labels, unknowns=lambda s: s.volume.values)
 
 
-def test_transforms_are_inverted():
+def test_bijectors_are_inverted():
     values = [
         (jvr.Softplus(2.0), [0.5, 3.0, 40.0]),
         (jvr.Sigmoid(), [0.1, 0.5, 0.99]),
         (jvr.Identity(), [-3.0, 0.0, 2.0]),
         (jvr.Ordered(0.5), [-1.0, 0.2, 7.0]),
     ]
-    for transform, expected in values:
-        np.testing.assert_allclose(transform.forward(transform.inverse(jnp.array(expected))), expected, rtol=2e-5)
-    # At the end of its range a transform has no slope: the start is moved inside.
+    for bijector, expected in values:
+        np.testing.assert_allclose(bijector.forward(bijector.inverse(jnp.array(expected))), expected, rtol=2e-5)
+    # At the end of its range a bijector has no slope: the start is moved inside.
     assert np.all(np.isfinite(jvr.Sigmoid().inverse(jnp.array([0.0, 1.0]))))
     assert np.isfinite(jvr.Softplus(1.0).inverse(jnp.array(0.0)))
 
@@ -434,8 +434,8 @@ def test_residuals_are_rendered_minus_target():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("of", ["colours", pytest.param("voxels", marks=pytest.mark.slow)])
-def test_a_fit_leaps_over_what_has_no_derivative(of):
-    """Mostly empty at the start: the same iterations with leaps and without."""
+def test_a_fit_skips_what_has_no_derivative(of):
+    """Mostly empty at the start: the same iterations with skips and without."""
     values = np.zeros((17, 17, 17), np.float32)
     values[6:10, 6:10, 6:10] = np.random.default_rng(0).uniform(0.3, 1.0, (4, 4, 4))
     transfer = jvr.LinearTransfer([0.1, 0.5, 1.0], np.random.default_rng(1).random((3, 3)), [0.0, 0.2, 0.6])

@@ -157,8 +157,8 @@ def test_fits_with_kept_samples_know_of_gaps():
 def test_radiance_transfer_of_a_volume_without_these_gaps_is_of_another():
     """Also where what is filled in happens to be what was there."""
     values = np.full((N, N, N), 0.5, np.float32)
-    made_for = lambda values: np.asarray(jvr.RadianceTransfer().made_for(jvr.Scene(jvr.Volume(values), TABLE)))
-    full, hidden = made_for(values), made_for(constant())
+    cache_key = lambda values: np.asarray(jvr.RadianceTransfer().cache_key(jvr.Scene(jvr.Volume(values), TABLE)))
+    full, hidden = cache_key(values), cache_key(constant())
     np.testing.assert_array_equal(jvr.Volume(constant()).values, values)
     assert full.shape != hidden.shape or not np.array_equal(full, hidden)
 

@@ -73,7 +73,7 @@ def close(found: jvr.Rendering, expected: jvr.Rendering, name: str):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_pictures_after_a_replacement_are_those_of_a_scene_made_anew(kind):
-    """With arrays at hand, and where the scene is an argument of a compiled function."""
+    """With concrete arrays, and where the scene is an argument of a compiled function."""
     check_pictures(kind, lambda name: "another" not in name)
 
 
@@ -107,7 +107,7 @@ def test_pictures_where_voxels_are_the_only_argument(kind):
     close(compiled(of_voxels)(after.values), as_argument(scene_of(kind, anew), camera), kind)
 
 
-@pytest.mark.parametrize("way", ["compiled", pytest.param("at hand", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("way", ["compiled", pytest.param("concrete", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["bricked", "graded"])
 def test_gradients_in_voxels_know_what_is_kept_of_them(kind, way):
     """The same with what is kept and without, at the voxels that it was made of and at others; by both modes."""

@@ -12,10 +12,10 @@ import pytest
 from scenes import compiled
 
 import jvr
+from jvr.effects.environment_lighting import environment_lighting
 from jvr.effects.grid import Grid
 from jvr.effects.light_space import bilinear
-from jvr.effects.natural_light import natural_light
-from jvr.effects.shading import share_of
+from jvr.effects.shading import surface_weight
 from jvr.numerics import clamp
 
 # Entries at whole numbers, as labels are: the second goes straight on, the third is a kink.
@@ -109,7 +109,7 @@ def test_opacity_by_gradient_from_zero(x64):
 def test_a_gradient_as_long_as_the_threshold(x64):
     """The share of a surface `m^2 / (m^2 + t^2)` is smooth there."""
     for m, t in ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (3.0, 3.0)):
-        found = jax.grad(share_of, argnums=(0, 1))(jnp.asarray(m), jnp.asarray(t))
+        found = jax.grad(surface_weight, argnums=(0, 1))(jnp.asarray(m), jnp.asarray(t))
         total = (m * m + t * t) ** 2
         np.testing.assert_allclose(found, [2 * m * t * t / total, -2 * t * m * m / total], rtol=1e-12)
 
@@ -148,7 +148,9 @@ def test_light_of_zero(x64):
 
     @compiled
     def reflected(light):
-        return natural_light(material, light, clamped=True, order=1, from_samples=False).reflect(s, s, up, tilted, ())[0][0]
+        return environment_lighting(material, light, clamped=True, order=1, from_samples=False).reflect(s, s, up, tilted, ())[0][
+            0
+        ]
 
     zero, tangent = jnp.zeros((4, 3)), jnp.asarray([[1.0], [0.3], [-0.2], [0.1]]) * jnp.ones(3)
     found = jax.jvp(reflected, (zero,), (tangent,))[1]

@@ -159,10 +159,10 @@ def test_point_light_beside_a_ray(x64):
     np.testing.assert_allclose(one(scene), expected, rtol=MIDPOINT)
 
 
-def arriving(light, x):
+def light_sample(light, x):
     """Direction, distance and grey irradiance at a place."""
-    found = light.arrives(tuple(jnp.asarray(x, float)), (jnp.asarray(1.0), jnp.asarray(0.0), jnp.asarray(0.0)))
-    return np.asarray(found.towards), float(found.distance), float(found.irradiance[0])
+    found = light.sample(tuple(jnp.asarray(x, float)), (jnp.asarray(1.0), jnp.asarray(0.0), jnp.asarray(0.0)))
+    return np.asarray(found.w_i), float(found.distance), float(found.irradiance[0])
 
 
 def test_falloff_of_a_point_light(x64):
@@ -170,17 +170,17 @@ def test_falloff_of_a_point_light(x64):
     for offset in ([2.0, 0, 0], [1, -2, 3], [1e-2, 0, 0], [0, 1e5, 0], [0, 0, 0]):
         r = np.linalg.norm(offset)
         x = position + offset
-        towards, distance, square = arriving(jvr.PointLight(position, 7.0, radius=0.05), x)
+        towards, distance, square = light_sample(jvr.PointLight(position, 7.0, radius=0.05), x)
         np.testing.assert_allclose(distance, r, rtol=1e-10)
         np.testing.assert_allclose(towards, -np.asarray(offset) / r if r else np.zeros(3), atol=1e-10)
         np.testing.assert_allclose(square, 7 / max(r, 0.05) ** 2, rtol=1e-10)
-        _, _, polynomial = arriving(jvr.PointLight(position, 7.0, attenuation=(0.5, 0.1, 0.02)), x)
+        _, _, polynomial = light_sample(jvr.PointLight(position, 7.0, attenuation=(0.5, 0.1, 0.02)), x)
         np.testing.assert_allclose(polynomial, 7 / (0.5 + 0.1 * r + 0.02 * r * r), rtol=1e-10)
 
 
 def test_cone_of_a_spot_light(x64):
     light = jvr.SpotLight([0, 0, 0], [0, 0, -3.0], 2.0, inner=20.0, outer=40.0)
-    at = lambda degrees: arriving(light, [4 * math.sin(math.radians(degrees)), 0, -4 * math.cos(math.radians(degrees))])[2]
+    at = lambda degrees: light_sample(light, [4 * math.sin(math.radians(degrees)), 0, -4 * math.cos(math.radians(degrees))])[2]
     for degrees in (0, 10, 19.99):
         np.testing.assert_allclose(at(degrees), 2 / 16, rtol=1e-12)
     for degrees in (40.01, 90, 180):
@@ -190,8 +190,8 @@ def test_cone_of_a_spot_light(x64):
         share = (math.cos(math.radians(degrees)) - edge) / (full - edge)
         np.testing.assert_allclose(at(degrees), share**2 * (3 - 2 * share) / 8, rtol=1e-12)
     # All around, and half a sphere.
-    assert arriving(jvr.SpotLight([0, 0, 0], [0, 0, 1], 1.0, inner=179.0, outer=180.0), [0, 0, -1])[2] == 0
-    assert arriving(jvr.SpotLight([0, 0, 0], [0, 0, 1], 1.0, inner=0.0, outer=90.0), [0, 0, 2.0])[2] == 0.25
+    assert light_sample(jvr.SpotLight([0, 0, 0], [0, 0, 1], 1.0, inner=179.0, outer=180.0), [0, 0, -1])[2] == 0
+    assert light_sample(jvr.SpotLight([0, 0, 0], [0, 0, 1], 1.0, inner=0.0, outer=90.0), [0, 0, 2.0])[2] == 0.25
 
 
 RISING = slab(np.linspace(0, 1, 9))

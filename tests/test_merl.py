@@ -27,8 +27,8 @@ def directions(theta_h, theta_d, phi_d):
 def table_of(brdf, cells=CELLS):
     """Reflectance in the middle of every cell, of three components; -1 where a direction is below the surface, as in measured data."""
     w_o, w_i = (tuple(jnp.asarray(c) for c in w) for w in directions(*cell_angles(*cells)))
-    tinted, plain = eqx.filter_jit(type(brdf).evaluate)(brdf, w_o, w_i)
-    material = [np.asarray(sum(part[c % len(part)] for part in (tinted, plain) if part)) for c in range(3)]
+    tinted, unmodulated = eqx.filter_jit(type(brdf).evaluate)(brdf, w_o, w_i)
+    material = [np.asarray(sum(part[c % len(part)] for part in (tinted, unmodulated) if part)) for c in range(3)]
     seen = (np.asarray(w_o[2]) > 0) & (np.asarray(w_i[2]) > 0)
     return np.stack([np.where(seen, m / np.where(seen, w_i[2], 1), -1) for m in material], axis=-1)
 
@@ -61,8 +61,8 @@ def pairs(n, seed, least=0.3):
 
 
 def by_colour(brdf, w_o, w_i):
-    tinted, plain = eqx.filter_jit(type(brdf).evaluate)(brdf, w_o, w_i)
-    return np.stack([sum(np.asarray(part[c % len(part)]) for part in (tinted, plain) if part) for c in range(3)])
+    tinted, unmodulated = eqx.filter_jit(type(brdf).evaluate)(brdf, w_o, w_i)
+    return np.stack([sum(np.asarray(part[c % len(part)]) for part in (tinted, unmodulated) if part) for c in range(3)])
 
 
 def test_a_file_comes_back_as_the_brdf_it_was_made_of(file, glossy):

@@ -32,10 +32,10 @@ SLOPE = 0.3
 
 @functools.partial(compiled, static_argnums=0)
 def _gradients(shape, normals, volume, transfer, points):
-    prepared = normals.prepared(volume, transfer)
+    graded = normals.with_gradients(volume, transfer)
 
     def one(p):
-        along = normals.gradient(transfer, shape, p, prepared.resample(volume, p))
+        along = normals.gradient(transfer, shape, p, graded.resample(volume, p))
         return jnp.stack(along) @ volume.axes_inverse
 
     return jax.vmap(one)(tuple(points.T))
@@ -142,7 +142,7 @@ def test_the_analytic_gradient_is_that_of_the_interpolant(x64):
 def test_what_is_deposited_is_the_derivative_of_what_is_read(scheme, of_opacity, x64):
     """For random cotangents of scalar, gradient and neighbours, in voxels, slope and intercept, inside and at the border."""
     volume = jvr.Volume(voxels((3, 4, 5)), slope=0.9, intercept=0.05)
-    normals = scheme(of_opacity).prepared(volume, linear_transfer())
+    normals = scheme(of_opacity).with_gradients(volume, linear_transfer())
     points = tuple(jnp.asarray(everywhere(volume.shape, 12).T))
     wanted = lambda v: (v.values, v.slope, v.intercept)
 
@@ -215,7 +215,7 @@ def test_rounding_decides_no_normal_of_an_opacity(scheme):
 def _in_world(volume, normals, transfer, points):
     """Gradients as shaders take them."""
     frame = GradientFrame(normals, volume.axes_inverse, volume.intercept, volume.shape)
-    field = VoxelField(volume, normals.prepared(volume, transfer))
+    field = VoxelField(volume, normals.with_gradients(volume, transfer))
 
     def one(p):
         point = Point(tuple(p), tuple(p), jnp.int32(0), jnp.int32(0))

@@ -1,4 +1,4 @@
-"""Empty-space skipping: bricks, leaps, and that a picture and its gradients are the same with and without."""
+"""Empty-space skipping: bricks, skips, and that a picture and its gradients are the same with and without."""
 
 import equinox as eqx
 import jax
@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scenes import OBLIQUE, compiled, perspective
 
 import jvr
+from jvr.march.jacobian import table_jacobian
 from jvr.march.march import MarchOptions
 from jvr.march.occupancy import RADII, occupancy_of
-from jvr.march.rows import table_rows
 from jvr.model.bricks import bricks_of
-from jvr.rendering.trace import aim, seen
+from jvr.rendering.trace import camera_rays, prepare
 
 SHAPES = [(9, 9, 9), (13, 6, 17), (1, 12, 10), (2, 3, 5), (1, 1, 1)]
 
@@ -32,19 +32,19 @@ def test_bricks_bound_the_voxels_around_each_of_their_points(shape, size):
 
 
 @pytest.mark.slow
-def test_reach_is_the_largest_known_empty_cube():
+def test_the_empty_radius_is_the_largest_known_empty_cube():
     """Against the definition, by brute force."""
     rng = np.random.default_rng(1)
     values = np.where(rng.random((31, 26, 29)) < 2e-3, 1.0, 0.0)
     table = jvr.LinearTransfer([0.0, 0.5, 1.0], np.ones((3, 3)), [0.0, 0.0, 1.0])
     bricks = bricks_of(jnp.asarray(values), 1)
-    reach = np.asarray(occupancy_of(bricks, jnp.asarray(1.0), jnp.asarray(0.0), table).reach)
+    empty_radius = np.asarray(occupancy_of(bricks, jnp.asarray(1.0), jnp.asarray(0.0), table).empty_radius)
     visible = np.argwhere(np.asarray(bricks.upper) > 0.5)
-    cells = np.stack(np.meshgrid(*map(np.arange, reach.shape), indexing="ij"), -1)
+    cells = np.stack(np.meshgrid(*map(np.arange, empty_radius.shape), indexing="ij"), -1)
     nearest = np.abs(cells[..., None, :] - visible).max(-1).min(-1)
     radii = np.asarray(RADII)
     largest = radii[np.searchsorted(radii, nearest - 1, side="right") - 1] + 1
-    np.testing.assert_array_equal(reach, np.where(nearest == 0, 0, largest))
+    np.testing.assert_array_equal(empty_radius, np.where(nearest == 0, 0, largest))
 
 
 TABLES = st.integers(2, 9).flatmap(lambda n: st.lists(st.sampled_from([0.0, 0.0, 1e-30, 0.05, 3.0]), min_size=n, max_size=n))
@@ -207,15 +207,15 @@ def test_gradient_where_matter_begins_is_the_same(x64):
     assert np.sum(on[:3] != 0) > 20
 
 
-def test_rows_are_the_same(x64):
-    """Those of extinctions leap over nothing; those of colours, alone, over what is empty."""
+def test_the_jacobian_is_the_same(x64):
+    """Those of extinctions skip nothing; those of colours, alone, what is empty."""
     volume, transfer = scene_of(np.random.default_rng(2), (9, 8, 11), float, 1.0)
     scene, camera = jvr.Scene(volume.bricked(2), transfer), perspective(volume, 6, 5)
 
     def rows(skipping, of_extinctions):
         choices = jvr.Settings(0.6, skipping=skipping)
-        aimed, _ = aim(scene, camera, choices, jnp.arange(30, dtype=jnp.int32), seen(scene, choices))
-        return table_rows(MarchOptions(0.0, False), *aimed, of_extinctions=of_extinctions)[1]
+        of_camera, _ = camera_rays(scene, camera, choices, jnp.arange(30, dtype=jnp.int32), prepare(scene, choices))
+        return table_jacobian(MarchOptions(0.0, False), *of_camera, of_extinctions=of_extinctions)[1]
 
     exact, everything, colours = (compiled(lambda o=o: rows(*o))() for o in ((False, True), (True, True), (True, False)))
     compare = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
@@ -286,7 +286,7 @@ def test_what_is_negligible_stays_below_its_bound(negligible, x64):
 
 @pytest.mark.slow
 def test_fit_leaves_out_what_is_negligible(x64):
-    """Rows of the table leap as gradients do: both give the same normal equations, and the fit still finds its target."""
+    """Rows of the table skip as gradients do: both give the same normal equations, and the fit still finds its target."""
     scene, camera = faint_scene(np.random.default_rng(0))
     target = jvr.render(scene, camera).rgb
     start = eqx.tree_at(lambda s: s.transfer.rgb, scene, jnp.full_like(scene.transfer.rgb, 0.5))

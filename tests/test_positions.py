@@ -10,7 +10,7 @@ import pytest
 from scenes import affine, compiled, linear_transfer, render_quickly
 
 import jvr
-from jvr.fitting.observations import observe, observed_medium, seen_in_fit
+from jvr.fitting.observations import observe, observed_medium, prepare_in_fit
 
 SETTINGS = jvr.Settings(0.6, termination=0)
 UTM = (759186.3, -2957195.7, 1203.1)
@@ -122,8 +122,8 @@ def test_rays_of_a_fit_keep_their_digits():
         scene, camera = build(origin, 1e4, "perspective")
         images = [np.zeros((camera.height, camera.width, 3), np.float32)]
         observations = observe(scene, [camera], images, None, SETTINGS)
-        seen = seen_in_fit(scene, SETTINGS, leaps=False)
-        return observed_medium(scene, observations, None, SETTINGS, seen)[1]
+        prepared = prepare_in_fit(scene, SETTINGS, skips=False)
+        return observed_medium(scene, observations, None, SETTINGS, prepared)[1]
 
     there, here = inside(UTM), inside((0.0, 0, 0))
     for a, b in zip(jax.tree.leaves(there), jax.tree.leaves(here), strict=True):

@@ -56,8 +56,8 @@ def references(table, s0, s1, dt):
 
 def all_models(table, s0, s1, dt, parts=1):
     """Emission of the two models that emit and optical depth of the two that absorb, a row for each segment."""
-    prepared = PreIntegratedTable(table, parts)
-    both = [jax.vmap(lambda a, b, d, m=m: prepared.segment(m, a, b, d))(s0, s1, dt) for m in MODELS]
+    integrated = PreIntegratedTable(table, parts)
+    both = [jax.vmap(lambda a, b, d, m=m: integrated.evaluate_segment(m, a, b, d))(s0, s1, dt) for m in MODELS]
     assert both[1][1] == both[2][0] == ()
     column = lambda channels: jnp.stack(jnp.broadcast_arrays(*(channels * (3 // len(channels)))), axis=1)
     return column(both[0][0]), column(both[1][0]), column(both[0][1]), column(both[2][1])
@@ -73,7 +73,7 @@ def models(table, ends, parts=1):
 
 def segment(table, s0, s1, dt, parts=1):
     """Three components of emission, and one or three of optical depth."""
-    emitted, dtau = PreIntegratedTable(table, parts).segment(MODELS[0], s0, s1, dt)
+    emitted, dtau = PreIntegratedTable(table, parts).evaluate_segment(MODELS[0], s0, s1, dt)
     return jnp.stack([*emitted, *dtau])
 
 
@@ -236,8 +236,10 @@ def test_equal_ends_are_a_segment_of_constant_properties(make):
     emitted, glow, dtau, _ = models(table, (s, s, np.full(6, dt)))
     for a, *found in zip(s, emitted, glow, dtau, strict=True):
         medium = table.evaluate(a)
-        radiance, depth = MODELS[0].segment(medium, dt)
-        for value, true in zip(found, (radiance, MODELS[1].segment(medium, dt)[0], depth * (3 // len(depth))), strict=True):
+        radiance, depth = MODELS[0].evaluate_segment(medium, dt)
+        for value, true in zip(
+            found, (radiance, MODELS[1].evaluate_segment(medium, dt)[0], depth * (3 // len(depth))), strict=True
+        ):
             np.testing.assert_allclose(value, true, rtol=1e-6)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jvr
-from jvr.fitting.unknowns import Exposed, choose_unknowns
+from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 from jvr.model.ranges import ANY
 
 VOLUME = jvr.Volume(np.random.default_rng(0).random((4, 5, 6)))
@@ -76,14 +76,14 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_no_step_leaves_the_range(name, bounds):
     scene, select, low, high = CASES[name]
-    model = Exposed(scene, None)
+    model = ExposedModel(scene, None)
     chosen = choose_unknowns(model, lambda m: select(m.scene), None, bounds)
-    start = chosen.real_from_model(model)
-    np.testing.assert_allclose(chosen.values_from_real(start, model), np.ravel(select(scene)), rtol=2e-5, atol=2e-5)
+    start = chosen.unconstrained_from_model(model)
+    np.testing.assert_allclose(chosen.values_from_unconstrained(start, model), np.ravel(select(scene)), rtol=2e-5, atol=2e-5)
     lower, upper, _ = chosen.limits(model, np.asarray(start))
     for far in (-1e6, 1e6):
         moved = np.clip(np.full(start.shape, far), lower, upper)
-        values = np.asarray(chosen.values_from_real(jnp.asarray(moved, jnp.float32), model))
+        values = np.asarray(chosen.values_from_unconstrained(jnp.asarray(moved, jnp.float32), model))
         assert np.all((values >= low) & (values <= high))
         # It comes as near to a finite end as float32 and what is open ask for, and as far as there is no end.
         end = low if far < 0 else high
@@ -104,13 +104,13 @@ def test_positions_stay_in_order(name, bounds):
         "domain": (SCENE, lambda s: s.transfer.domain),
         "positions by value": (SCENE, lambda s: s.scattering.albedo.positions),
     }[name]
-    model = Exposed(scene, None)
+    model = ExposedModel(scene, None)
     chosen = choose_unknowns(model, lambda m: select(m.scene), None, bounds)
-    start = np.asarray(chosen.real_from_model(model))
-    np.testing.assert_allclose(chosen.values_from_real(jnp.asarray(start), model), select(scene), rtol=1e-5)
+    start = np.asarray(chosen.unconstrained_from_model(model))
+    np.testing.assert_allclose(chosen.values_from_unconstrained(jnp.asarray(start), model), select(scene), rtol=1e-5)
     lower, upper, _ = chosen.limits(model, start)
     moved = np.clip(start + np.array([-30.0, -5.0, -5.0])[: start.size], lower, upper)
-    values = chosen.values_from_real(jnp.asarray(moved, jnp.float32), model)
+    values = chosen.values_from_unconstrained(jnp.asarray(moved, jnp.float32), model)
     assert np.all(np.diff(values) > 0)
     # Scalars below zero are as good as others.
     assert values[0] < -10
@@ -119,10 +119,10 @@ def test_positions_stay_in_order(name, bounds):
 def test_a_start_outside_of_its_range_is_named():
     bright = eqx.tree_at(lambda s: s.transfer.rgb, SCENE, SCENE.transfer.rgb.at[1, 2].set(1.5))
     with pytest.raises(ValueError, match=r"transfer\.rgb starts at 1\.5, outside of 0 \.\.\. 1.*jvr\.Bounded") as caught:
-        choose_unknowns(Exposed(bright, None), lambda m: m.scene.transfer.rgb)
+        choose_unknowns(ExposedModel(bright, None), lambda m: m.scene.transfer.rgb)
     assert "\n" not in str(caught.value)
-    chosen = choose_unknowns(Exposed(bright, None), lambda m: m.scene.transfer.rgb, (jvr.Bounded(0.0, 10.0),))
-    assert float(jnp.max(chosen.real_from_model(Exposed(bright, None)))) == 1.5
+    chosen = choose_unknowns(ExposedModel(bright, None), lambda m: m.scene.transfer.rgb, (jvr.Bounded(0.0, 10.0),))
+    assert float(jnp.max(chosen.unconstrained_from_model(ExposedModel(bright, None)))) == 1.5
 
 
 @pytest.mark.parametrize(
@@ -167,11 +167,11 @@ def test_constructors_and_fits_keep_to_one_range(name):
 def test_attenuation_has_a_range_for_each_entry():
     """A part that is zero, as constructors take it, is where a fit that keeps to bounds starts; the constant stays above zero."""
     lit = eqx.tree_at(lambda s: POINT(s).attenuation, SCENE, jnp.array([1.0, 0.0, 0.2]))
-    model = Exposed(lit, None)
+    model = ExposedModel(lit, None)
     chosen = choose_unknowns(model, lambda m: POINT(m.scene).attenuation, None, ANY)
-    start = chosen.real_from_model(model)
-    np.testing.assert_array_equal(chosen.values_from_real(start, model), np.float32([1.0, 0.0, 0.2]))
-    lowest = chosen.values_from_real(jnp.asarray(chosen.limits(model, np.asarray(start))[0]), model)
+    start = chosen.unconstrained_from_model(model)
+    np.testing.assert_array_equal(chosen.values_from_unconstrained(start, model), np.float32([1.0, 0.0, 0.2]))
+    lowest = chosen.values_from_unconstrained(jnp.asarray(chosen.limits(model, np.asarray(start))[0]), model)
     np.testing.assert_array_equal(lowest[1:], 0.0)
     assert 0 < lowest[0] < 1e-5
     for wrong in ((0.0, 1.0, 1.0), (1.0, -0.1, 0.0), (1.0, 0.0, np.nan)):
@@ -179,7 +179,7 @@ def test_attenuation_has_a_range_for_each_entry():
             jvr.PointLight((0, 0, 0), attenuation=wrong)
     negative = eqx.tree_at(lambda s: POINT(s).attenuation, SCENE, jnp.array([1.0, -0.5, 0.2]))
     with pytest.raises(ValueError, match=r"attenuation starts at -0\.5"):
-        choose_unknowns(Exposed(negative, None), lambda m: POINT(m.scene).attenuation)
+        choose_unknowns(ExposedModel(negative, None), lambda m: POINT(m.scene).attenuation)
 
 
 @pytest.mark.slow

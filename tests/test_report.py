@@ -12,7 +12,7 @@ from jvr.fitting.fit import FitResult, FitStats, Iteration
 from jvr.pictures import srgb_from_linear
 from jvr.report.errors import field_errors
 from jvr.report.page import write_fit_page
-from jvr.report.page.words import with_error, worst_in_words
+from jvr.report.page.words import least_determined_in_words, with_error
 from jvr.report.plots import comparison_strip, plot_convergence, plot_transfer, png
 from jvr.report.plots.pictures import difference_factor
 
@@ -375,7 +375,7 @@ def test_values_are_rounded_to_their_errors(value, error, wanted):
 
 def test_worst_combination_in_words():
     gaussians = jvr.GaussianTransfer([5.0], [1.0], [1.0], [[1, 1, 1]])
-    assert worst_in_words((("transfer.height[0]", 0.9), ("exposure[]", 0.1)), gaussians) == (
+    assert least_determined_in_words((("transfer.height[0]", 0.9), ("exposure[]", 0.1)), gaussians) == (
         "Changing the height of Gaussian 0 (at 5) and exposure together hardly changes the pictures."
     )
 
@@ -400,5 +400,5 @@ def test_page_of_a_real_fit(tmp_path):
 def test_where_no_unknown_is_seen_the_page_says_so():
     """As after a fit whose light has become negative everywhere and is cut off."""
     transfer = jvr.LutTransfer([[0, 0, 0], [1, 1, 1]], [0, 1], [0, 1])
-    words = worst_in_words((("material.albedo[]", 0.0), ("environment.coefficients[0, 0]", 0.0)), transfer)
+    words = least_determined_in_words((("material.albedo[]", 0.0), ("environment.coefficients[0, 0]", 0.0)), transfer)
     assert words == "No unknown changes the pictures."

@@ -197,7 +197,7 @@ def test_deep_map_keeps_its_error_and_reports_where_it_cannot(x64):
 
 @pytest.mark.parametrize("shadows", [jvr.ShadowRays(0.7), pytest.param(jvr.ShadowVolume(1.0), marks=pytest.mark.slow)])
 def test_skipping_changes_nothing(shadows):
-    """Bricks that are empty are leapt over by the eye's rays and by the light's."""
+    """Bricks that are empty are skipped by the eye's rays and by the light's."""
     values = voxels((17, 15, 16))
     values[:, 6:, :9] = 0
     volume = jvr.Volume(values, affine((1.0, 1.3, 0.9), angles=(0.3, 0.1, -0.4)))

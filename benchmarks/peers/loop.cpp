@@ -1,6 +1,6 @@
 // The machine's own limit: emission and absorption along rays, with the shortcuts of a good volume renderer and nothing else.
 // Voxels have 16 bits and lie brick by brick, so that a ray stays in few cache lines; the transfer function is multiplied out for the
-// step; rays leap over bricks that are empty under it and end once nothing behind can be seen.
+// step; rays skip bricks that are empty under it and end once nothing behind can be seen.
 
 #include <algorithm>
 #include <atomic>
@@ -81,8 +81,8 @@ void find_empty(Volume& v) {
         for (int c = 0; c < m[2]; c++) spread(v.distance, v.brick(0, b, c), size_t(m[1]) * m[2], m[0], line);
 }
 
-// The first sample at or behind `k` that may not be empty, as far as the nearest brick that is not allows to leap.
-inline int leap(Int4 brick, int d, const float* entry, const float* inverse, float step, int k) {
+// The first sample at or behind `k` that may not be empty, as far as the nearest brick that is not allows to skip.
+inline int skip(Int4 brick, int d, const float* entry, const float* inverse, float step, int k) {
     float exit = 1e30f;
     for (int axis = 0; axis < 3; axis++) {
         const float face = inverse[axis] > 0 ? float((brick[axis] + d) * BRICK) : float((brick[axis] - d + 1) * BRICK);
@@ -125,7 +125,7 @@ Float4 trace(const Volume& v, const float* start, const float* way, float length
         const Int4 brick = cell >> LOG_BRICK;
         const size_t here = v.brick(brick[0], brick[1], brick[2]);
         if (const int d = v.distance[here]) {
-            k = leap(brick, d, start, inverse, step, k);
+            k = skip(brick, d, start, inverse, step, k);
             continue;
         }
         const float s = interpolate(&v.voxels[here * STRIDE], cell & (BRICK - 1), p - __builtin_convertvector(cell, Float4));

@@ -1,4 +1,4 @@
-"""`jvr plan --measure` and `--tolerance`."""
+"""`jvr plan --measure` and `--tolerance`: what each effect costs and shows, and which could go."""
 
 import time
 from typing import Any

@@ -20,7 +20,7 @@ class Beforehand:
         from jvr.io.precompute import precompute
 
         note = lambda part: self.report.append(part._asdict())
-        with bar("light from all around") as show:
+        with bar("environment lighting") as show:
             return precompute(scene, cache=cache_folder("precomputed"), progress=show, report=note, **keywords)
 
 

@@ -43,21 +43,21 @@ def fit_scene(config: Config, folder: Path, *, resume: bool = False, force: bool
             whole.enter_context(alone_in(folder))
         with reading(), progress("reading the volume and the target images"):
             check_results(folder, inputs_of(config), resume=resume, force=force)
-            job = build_fit(config, prepare=beforehand)
+            job = build_fit(config, precompute=beforehand)
         if not is_there:
             folder.mkdir(parents=True, exist_ok=True)
             whole.enter_context(alone_in(folder))
-        whole.enter_context(_about_the_kept_transfer(job))
+        whole.enter_context(_about_the_kept_radiance_transfer(job))
         result = _fit(job, checkpoint, resume)
         with progress("writing the results"):
             return _write(config, job, result, folder, began, beforehand)
 
 
 @contextlib.contextmanager
-def _about_the_kept_transfer(job: FitJob) -> Iterator[None]:
-    """No warnings that a transfer is kept which the configuration asks to keep."""
+def _about_the_kept_radiance_transfer(job: FitJob) -> Iterator[None]:
+    """No warnings that a radiance transfer is kept which the configuration asks to keep."""
     with warnings.catch_warnings():
-        if job.keeps_transfer:
+        if job.keeps_radiance_transfer:
             warnings.filterwarnings("ignore", "the radiance transfer was computed for another", RuntimeWarning)
         yield
 
@@ -96,7 +96,7 @@ def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float,
         _write_views(folder, f"held_out_{i:02d}", target, found)
     write_transfer(folder / TRANSFER, result.scene.transfer)
     report = _report(config, job, result, (fitted, held_fitted))
-    report["transfer_kept"] = _with_transfer_of_its_own(job, result, beforehand) if job.keeps_transfer else None
+    report["transfer_kept"] = _with_transfer_of_its_own(job, result, beforehand) if job.keeps_radiance_transfer else None
     report |= {"precomputed": beforehand.report, "seconds": time.perf_counter() - began}
     with replacing(folder / RESULT) as temporary:
         temporary.write_text(json.dumps(report, allow_nan=False, indent=1), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""`jvr render`."""
+"""`jvr render`: pictures of a configuration or of a volume file."""
 
 import math
 import time

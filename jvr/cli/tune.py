@@ -1,4 +1,4 @@
-"""`jvr tune`."""
+"""`jvr tune`: the cheapest settings for a wanted error, or the most accurate ones for a wanted time."""
 
 import re
 import time

@@ -1,4 +1,4 @@
-"""Surfaces where a clipping box cuts the medium open.
+"""Cut faces: normals of the surfaces where a clipping box cuts the medium open.
 
 Inside of what is cut the gradient is that of noise, and within a voxel of the cut it is made of voxels that are not there. A layer behind
 each face of the box is therefore shaded with the normal of the face. That a cut is lit as a surface and what lies behind it by its gradient
@@ -15,22 +15,22 @@ from jvr.types import Scalar, Triple
 
 
 class CutFaces(eqx.Module):
-    """The faces of a box. `layer`: a point up to this world length behind a face belongs to it, one that is twice as deep does not, with
-    a smooth cubic in between."""
+    """The cut faces of a clipping box. `layer`: a point up to this world length behind a face belongs to it, one that is twice as deep
+    does not, with a smooth cubic in between."""
 
     box: ClippingBox
     layer: Scalar
 
     def normal(self, x: Triple, normal: Triple) -> tuple[Triple, Scalar]:
-        """The unit normal of a point in the world, and the share of it that is a cut. `normal`: that of its gradient, as long as the share
-        of the point that is a surface.
+        """The unit normal of a point in the world, and the fraction of it that is a cut. `normal`: that of its gradient, as long as the
+        fraction of the point that is a surface.
         Differentiable; detached: which of two opposite faces is nearer."""
-        outward, share = [], jnp.zeros_like(x[0])
+        outward, fraction = [], jnp.zeros_like(x[0])
         for c, low, high in zip(x, self.box.lower, self.box.upper, strict=True):
             from_low = c - low < high - c
             near = jnp.clip(2 - jnp.where(from_low, c - low, high - c) / self.layer, 0.0, 1.0)
             weight = near * near * (3 - 2 * near)
             outward.append(jnp.where(from_low, -weight, weight))
-            share = jnp.maximum(share, weight)
-        mixed, _ = direction_and_length(tuple(o + (1 - share) * n for o, n in zip(outward, normal, strict=True)))
-        return mixed, share
+            fraction = jnp.maximum(fraction, weight)
+        mixed, _ = direction_and_length(tuple(o + (1 - fraction) * n for o, n in zip(outward, normal, strict=True)))
+        return mixed, fraction

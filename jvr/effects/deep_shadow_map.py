@@ -20,11 +20,11 @@ from jvr.types import Affine, Channels, Scalar, Triple
 
 
 class DeepShadowMap(AbstractShadows):
-    """A map of rays, along each of which transmittance is kept as at most `layers` straight pieces.
+    """A deep shadow map: rays of a light, along each of which transmittance is kept as at most `layers` straight pieces.
 
     A piece goes on as long as the straight line from its start through the transmittance at its end stays within `error` of all that it
     passes. Where `layers` pieces do not suffice, the last one goes straight to the end of the ray, with an error that nothing bounds:
-    `rendering.stats.shadows` says what share of the rays that were, and the largest error of any.
+    `rendering.stats.shadows` says what fraction of the rays that were, and the largest error of any.
 
     **Arguments:** `texels`: rays along each axis of the map; `layers`: pieces of each, at least 1; `error`: of transmittance, above 0.
 
@@ -44,7 +44,7 @@ class DeepShadowMap(AbstractShadows):
             raise ValueError(f"error must be a difference of transmittance above 0 and below 1, not {error!r}")
         self.texels, self.layers, self.error = texels, layers, error
 
-    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         steps = max(self.layers, math.ceil(math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape))))
         maps = []
         for light in lights:
@@ -62,7 +62,7 @@ class DeepShadowMap(AbstractShadows):
 
 
 class ShadowStats(NamedTuple):
-    """How well the pieces of a deep shadow map follow the transmittance: the share of rays that ran out of pieces, and the largest error
+    """How well the pieces of a deep shadow map follow the transmittance: the fraction of rays that ran out of pieces, and the largest error
     along any ray."""
 
     overflow: Scalar
@@ -70,7 +70,7 @@ class ShadowStats(NamedTuple):
 
 
 class DeepMap(eqx.Module):
-    """For each ray of a light, the depths `w` where pieces meet and the transmittances there."""
+    """The deep shadow map of one light: for each ray, the depths `w` where pieces meet and the transmittances there."""
 
     space: AbstractLightSpace
     depths: Float[Array, "u v nodes channels"]
@@ -80,7 +80,7 @@ class DeepMap(eqx.Module):
     def transmittance(self, x: Triple) -> Channels:
         """At a world position: along each of the four rays around it, then bilinearly."""
         texels, _, nodes, channels = self.depths.shape
-        u, v, w = self.space.place(x)
+        u, v, w = self.space.coordinates(x)
         depths, clear = self.depths.reshape(-1, channels), self.clear.reshape(-1, channels)
         total = [jnp.zeros_like(u)] * channels
         for texel, weight in bilinear(texels, u, v):
@@ -90,7 +90,7 @@ class DeepMap(eqx.Module):
 
 
 class DeepVisibility(AbstractVisibility):
-    """A deep map for each light, or `None` for those that nothing shades."""
+    """Visibility by a deep shadow map for each light, or `None` for those that nothing shades."""
 
     world_from_grid: Affine
     maps: tuple[DeepMap | None, ...]
@@ -111,8 +111,8 @@ def _along(z: Float[Array, "nodes"], T: Float[Array, "nodes"], w: Scalar) -> Sca
     value = T[0]
     for k in range(z.shape[0] - 1):
         length = z[k + 1] - z[k]
-        share = jnp.clip((w - z[k]) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
-        value += jnp.where(length > 0, share, 0.0) * (T[k + 1] - T[k])
+        fraction = jnp.clip((w - z[k]) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
+        value += jnp.where(length > 0, fraction, 0.0) * (T[k + 1] - T[k])
     return value
 
 

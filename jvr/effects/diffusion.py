@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float
 from jvr.model.dipole import Dipole
 from jvr.model.volume import Volume
 
-# Places in a node's cell, along each axis, over which the kernel is averaged: it may be narrower than a cell.
-PLACES = 4
+# Quadrature nodes in the cell of a grid node, along each axis, over which the kernel is averaged: it may be narrower than a cell.
+NODES = 4
 
 
 def scatter(
@@ -28,8 +28,8 @@ def scatter(
     over the nodes `x_i` of the medium (`there`) in a neighbourhood, with the dipole's diffuse reflectance `R_d` and its total `R`.
     The paper's equation (4) divides by the number of neighbours instead, which leaves the scale of the picture to the units of `R_d`.
 
-    **Arguments:** `radius`: of the neighbourhood, as a share of the volume's longest side, and at most that share of the longest axis in
-    voxels along each (they may differ where voxels are longer than wide). By FFT, so that the time hardly depends on it.
+    **Arguments:** `radius`: of the neighbourhood, as a fraction of the volume's longest side, and at most that fraction of the longest axis
+    in voxels along each (they may differ where voxels are longer than wide). By FFT, so that the time hardly depends on it.
     Differentiable in everything.
     """
     kernel = kernel_of(dipole, radius, volume, there.shape)
@@ -54,15 +54,15 @@ def kernel_of(dipole: Dipole, radius: float, volume: Volume, shape: tuple[int, .
     """`R_d` averaged over the cells of the nodes around a node, in each colour; zero beyond the radius."""
     steps = [(n - 1) / (m - 1) if m > 1 else 1.0 for n, m in zip(volume.shape, shape, strict=True)]
     longest = max(n - 1 for n in volume.shape)
-    reach = [min(math.ceil(radius * longest / step), m - 1) if m > 1 else 0 for step, m in zip(steps, shape, strict=True)]
-    offsets = np.stack(np.meshgrid(*[np.arange(-r, r + 1) for r in reach], indexing="ij"), axis=-1)
+    half_widths = [min(math.ceil(radius * longest / step), m - 1) if m > 1 else 0 for step, m in zip(steps, shape, strict=True)]
+    offsets = np.stack(np.meshgrid(*[np.arange(-r, r + 1) for r in half_widths], indexing="ij"), axis=-1)
     axes = volume.world_from_grid[:3, :3] * jnp.asarray(steps)
     length = lambda offset: jnp.linalg.norm(offset @ axes.T, axis=-1)
     side = jnp.max(volume.spacing * (np.asarray(volume.shape) - 1))
     inside = length(jnp.asarray(offsets, axes.dtype)) <= radius * side
-    fractions = np.stack(np.meshgrid(*[(np.arange(PLACES) + 0.5) / PLACES - 0.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    places = offsets[..., None, :] + fractions
-    values = jnp.stack(dipole.reflectance(length(jnp.asarray(places, axes.dtype))))
+    fractions = np.stack(np.meshgrid(*[(np.arange(NODES) + 0.5) / NODES - 0.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    nodes = offsets[..., None, :] + fractions
+    values = jnp.stack(dipole.reflectance(length(jnp.asarray(nodes, axes.dtype))))
     return jnp.where(inside, jnp.mean(values, axis=-1), 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Coordinates as a light sees the volume, and what lies along its rays.
+"""Light space: coordinates as a light sees the volume, and what lies along its rays.
 
 `(u, v)` in [-1, 1]^2 is a ray of the light and `w` in [0, 1] how far along it a point lies, from where the volume may begin to where it
 ends. For directional light rays are parallel. Those of a point are fanned out over the cone that holds the volume, or over all directions
@@ -24,7 +24,7 @@ from jvr.model.volume import Volume
 from jvr.numerics import clamp, direction_and_length, dot, larger, ray_box, rounded_into, smaller
 from jvr.types import Channels, Scalar, Triple, Vector
 
-# A light nearer to the bounding sphere of the volume than this share of its radius shines in all directions.
+# A light nearer to the bounding sphere of the volume than this fraction of its radius shines in all directions.
 NEAR = 1.01
 # Samples of a sweep that are taken at a time: enough to outweigh what it costs to start an operation and to share it between cores.
 SWEPT = 65536
@@ -34,7 +34,7 @@ class AbstractLightSpace(eqx.Module):
     """The coordinates of one light."""
 
     @abc.abstractmethod
-    def place(self, x: Triple) -> Triple:
+    def coordinates(self, x: Triple) -> Triple:
         """`(u, v, w)` of a world position."""
 
     @abc.abstractmethod
@@ -43,13 +43,13 @@ class AbstractLightSpace(eqx.Module):
 
 
 class ParallelSpace(AbstractLightSpace):
-    """Directional light: `center + half_u u U + half_v v V + half_w (2 w - 1) A`."""
+    """The light space of directional light: `center + half_u u U + half_v v V + half_w (2 w - 1) A`."""
 
     center: Vector
     axes: Float[Array, "3 3"]
     half: Vector
 
-    def place(self, x: Triple) -> Triple:
+    def coordinates(self, x: Triple) -> Triple:
         offset = tuple(c - self.center[i] for i, c in enumerate(x))
         u, v, a = (dot(offset, tuple(row)) / self.half[i] for i, row in enumerate(self.axes))
         return u, v, (a + 1) / 2
@@ -62,15 +62,16 @@ class ParallelSpace(AbstractLightSpace):
 
 
 class FanSpace(AbstractLightSpace):
-    """A point: unit directions are placed at `rho = sin(theta / 2) / reach` about the axis, and rays go from `near` to `far`."""
+    """The light space of a point: unit directions lie at `rho = sin(theta / 2) / rim` about the axis, 1 at the edge of the cone of its
+    rays, which go from `near` to `far`."""
 
     position: Vector
     axes: Float[Array, "3 3"]
-    reach: Scalar
+    rim: Scalar
     near: Scalar
     far: Scalar
 
-    def place(self, x: Triple) -> Triple:
+    def coordinates(self, x: Triple) -> Triple:
         d, distance = direction_and_length(tuple(c - self.position[i] for i, c in enumerate(x)))
         across, up, along = (dot(d, tuple(row)) for row in self.axes)
         # sin(theta / 2) / sin(theta) = 1 / (2 cos(theta / 2)), smooth about the axis; behind the light `sin(theta / 2)` itself, whose
@@ -80,14 +81,14 @@ class FanSpace(AbstractLightSpace):
         (a, b, _), sideways = direction_and_length((across, up, jnp.zeros_like(along)))
         a = jnp.where(sideways > 0, a, 1.0)
         rho = jnp.sqrt(0.5 * (1 - jnp.where(ahead, 0.0, along)))
-        u, v = (jnp.where(ahead, c * scale, rho * d) / self.reach for c, d in ((across, a), (up, b)))
+        u, v = (jnp.where(ahead, c * scale, rho * d) / self.rim for c, d in ((across, a), (up, b)))
         return u, v, (distance - self.near) / (self.far - self.near)
 
     def ray(self, u: Scalar, v: Scalar) -> tuple[Triple, Triple, Scalar]:
         across, up, along = self.axes
-        square = jnp.minimum((u * u + v * v) * self.reach**2, 1.0)
+        square = jnp.minimum((u * u + v * v) * self.rim**2, 1.0)
         # The clamp keeps the root's derivative finite in the corners of the square, which stand for no direction.
-        sideways = 2 * self.reach * jnp.sqrt(jnp.maximum(1 - square, 1e-6))
+        sideways = 2 * self.rim * jnp.sqrt(jnp.maximum(1 - square, 1e-6))
         d = tuple((1 - 2 * square) * along[i] + sideways * (u * across[i] + v * up[i]) for i in range(3))
         d, _ = direction_and_length(d)
         return tuple(self.position[i] + self.near * d[i] for i in range(3)), d, self.far - self.near
@@ -165,13 +166,13 @@ def depth_nodes(
     """Optical depth from the light to `layers + 1` equally distant depths of `texels^2` rays, by the midpoint rule with `samples` samples a
     layer, swept away from the light."""
     axis = jnp.linspace(-1.0, 1.0, texels)
-    places = jnp.stack([c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij")], axis=1)
-    places = jnp.pad(places, ((0, -(texels**2) % shares()), (0, 0)), mode="edge")
+    coordinates = jnp.stack([c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij")], axis=1)
+    coordinates = jnp.pad(coordinates, ((0, -(texels**2) % shares()), (0, 0)), mode="edge")
 
-    def share(shared: tuple[AbstractLightSpace, Scene, Medium], places: Float[Array, "rays 2"]) -> Array:
-        return _swept(*shared, places, layers, samples)
+    def share(shared: tuple[AbstractLightSpace, Scene, Medium], coordinates: Float[Array, "rays 2"]) -> Array:
+        return _swept(*shared, coordinates, layers, samples)
 
-    swept = over_rays(share, (space, scene, medium), places)
+    swept = over_rays(share, (space, scene, medium), coordinates)
     return jnp.moveaxis(swept[: texels**2], 1, 0).reshape(layers + 1, texels, texels, -1)
 
 
@@ -179,18 +180,18 @@ def _swept(
     space: AbstractLightSpace,
     scene: Scene,
     medium: Medium,
-    places: Float[Array, "rays 2"],
+    coordinates: Float[Array, "rays 2"],
     layers: int,
     samples: int,
 ) -> Float[Array, "rays nodes channels"]:
-    """`depth_nodes` of the rays in some places `(u, v)`."""
-    u, v = places.T
+    """`depth_nodes` of the rays at some coordinates `(u, v)`."""
+    u, v = coordinates.T
     rays = rays_through(space, scene, u, v)
     together = min(max(1, SWEPT // (u.size * samples)), layers)
     blocks = -(-layers // together)
     of_all = jax.tree.map(lambda x: jnp.tile(x, together * samples), rays)
 
-    # Checkpointed: the way back computes a block of layers again rather than keep all of its voxels.
+    # Checkpointed: the reverse pass computes a block of layers again rather than keep all of its voxels.
     @jax.checkpoint
     def sweep(tau: Channels, block: Array) -> tuple[Channels, Channels]:
         steps = block * together * samples + jnp.arange(together * samples, dtype=u.dtype)

@@ -1,4 +1,4 @@
-"""The light at a sample, and what it adds to the medium's own: `j = sigma_t (rgb a + b)`.
+"""Local lighting: the light at a sample, and what it adds to the medium's own, `j = sigma_t (rgb a + b)`.
 
 `a` is what shading makes of the light (1 without shading), `b` what is reflected in the light's own colour and what is scattered:
 
@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from jvr.effects.cut import CutFaces
-from jvr.effects.own_shadow import Segment
-from jvr.effects.shading import share_of
+from jvr.effects.self_shadow import ShadedSegment
+from jvr.effects.shading import surface_weight
 from jvr.march.shaders import OpticalShader, PreIntegratedShader, where_known
 from jvr.march.steps import Point, Sample
 from jvr.model.by_value import at_value
@@ -35,72 +35,76 @@ class LitShader(OpticalShader):
     shading: AbstractShading | None
     scattering: AbstractScattering | None
     cut: CutFaces | None = None  # where surfaces are clipped
-    natural: Any = None  # a `jvr.effects.natural_light.NaturalLight`, where there is light from all around
+    environment: Any = None  # a `jvr.effects.environment_lighting.EnvironmentLighting`, where the scene has an environment
 
-    def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        factor, added = self.light_at(sample, point, medium, dt)
-        rgb = tuple(c * a + b for c, a, b in zip(medium.rgb, factor, added, strict=True))
-        return self.optical.segment(Classified(rgb, medium.sigma_t), dt)
+    def shade(self, classified: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        factor, added = self.light_at(sample, point, classified, dt)
+        rgb = tuple(c * a + b for c, a, b in zip(classified.rgb, factor, added, strict=True))
+        return self.optical.evaluate_segment(Classified(rgb, classified.sigma_t), dt)
 
-    def light_at(self, sample: Sample, point: Point, medium: Classified, dt: Scalar) -> tuple[Triple, Triple]:
+    def light_at(self, sample: Sample, point: Point, classified: Classified, dt: Scalar) -> tuple[Triple, Triple]:
         """`a` and `b` of a sample that stands for a segment of length `dt` of a medium."""
         zero = jnp.zeros_like(sample.s)
         x = transformed(self.world_from_grid, point.p)
         w_o, _ = direction_and_length(turned(-self.world_from_grid[:3, :3], point.direction))
         shading, scattering = at_value((self.shading, self.scattering), sample.s)
         normal, magnitude = direction_and_length(tuple(-g for g in sample.gradient)) if sample.gradient else ((zero,) * 3, zero)
-        surface = zero if shading is None else shading.surface_share(magnitude)
+        surface = zero if shading is None else shading.surface_weight(magnitude)
         cut = zero
         if self.cut is not None:
             # What is hardly a surface has hardly a say in the normal.
-            share = surface if self.natural is None or shading is not None else share_of(magnitude, self.natural.threshold)
-            normal, cut = self.cut.normal(x, tuple(share * n for n in normal))
+            weight = (
+                surface
+                if self.environment is None or shading is not None
+                else surface_weight(magnitude, self.environment.threshold)
+            )
+            normal, cut = self.cut.normal(x, tuple(weight * n for n in normal))
             surface = surface + cut * (1 - surface)
-        scatters = zero + 1 if scattering is None or not scattering.needs_gradient else scattering.share(magnitude)
+        scatters = zero + 1 if scattering is None or not scattering.needs_gradient else scattering.medium_weight(magnitude)
         # Where there is a switch, what is not a surface scatters and does not reflect.
         reflects = 1 - scatters if scattering is not None and scattering.needs_gradient else zero + 1
         # A medium that nothing reflects from glows as it is.
-        glows = shading is None and self.natural is None
+        glows = shading is None and self.environment is None
         factor, added = [zero + 1 if glows else zero] * 3, [zero] * 3
-        arrives = sample.light or ((),) * (len(self.lights) + 1)
-        for light, transmittance in zip(self.lights, arrives, strict=False):
-            towards, _, irradiance = light.arrives(x, w_o)
-            arriving = _times(irradiance, transmittance)
+        transmittances = sample.light or ((),) * (len(self.lights) + 1)
+        for light, transmittance in zip(self.lights, transmittances, strict=False):
+            w_i, _, irradiance = light.sample(x, w_o)
+            incident = _times(irradiance, transmittance)
             if shading is not None:
-                diffuse, specular = shading.reflect(surface, normal, w_o, towards)
-                factor = [f + reflects * diffuse * e for f, e in zip(factor, arriving, strict=True)]
+                diffuse, specular = shading.reflect(surface, normal, w_o, w_i)
+                factor = [f + reflects * diffuse * e for f, e in zip(factor, incident, strict=True)]
                 if specular is not None:
-                    added = [b + reflects * specular * e for b, e in zip(added, arriving, strict=True)]
+                    added = [b + reflects * specular * e for b, e in zip(added, incident, strict=True)]
             if scattering is not None:
-                scattered = _times(arriving, scattering.scatter(w_o, towards))
+                scattered = _times(incident, scattering.scatter(w_o, w_i))
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
         for light in self.ambient:
             if shading is not None:
-                factor = [f + reflects * shading.ambient_share() * e for f, e in zip(factor, light.rgb, strict=True)]
+                factor = [f + reflects * shading.ambient_reflectance() * e for f, e in zip(factor, light.rgb, strict=True)]
             if scattering is not None:
                 scattered = _times(light.rgb, scattering.scatter_ambient())
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
-        if self.natural is not None:
-            around = arrives[len(self.lights)] if len(arrives) > len(self.lights) else ()
-            here = Segment(medium, sample.gradient, dt)
-            tinted, plain = self.natural.reflect(sample.s, magnitude, normal, w_o, around, cut, here)
+        if self.environment is not None:
+            around = transmittances[len(self.lights)] if len(transmittances) > len(self.lights) else ()
+            here = ShadedSegment(classified, sample.gradient, dt)
+            tinted, unmodulated = self.environment.reflect(sample.s, magnitude, normal, w_o, around, cut, here)
             factor = [f + reflects * c for f, c in zip(factor, tinted, strict=True)]
-            added = [b + reflects * c for b, c in zip(added, plain, strict=True)]
+            added = [b + reflects * c for b, c in zip(added, unmodulated, strict=True)]
         return tuple(factor), tuple(added)
 
 
 class LitPreIntegratedShader(LitShader, PreIntegratedShader):
-    """The scalar linear along a segment, the light that of the mean of its ends."""
+    """Pre-integration in a lit medium: the scalar linear along a segment, the light that of the mean of its ends."""
 
-    def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+    def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
-        emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
-        middle = self.prepare(transfer.table, _mean(front, back), point)
+        emitted, dtau = transfer.evaluate_segment(self.optical, front.s, back.s, dt)
+        middle = self.in_world(transfer.table, _mean(front, back), point)
         factor, added = self.light_at(middle, point, transfer.evaluate(middle.s), dt)
         # A constant colour of the given optical depth.
-        extra, _ = self.optical.segment(Classified(added, dtau), jnp.ones_like(dt))
-        look = tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False))
-        return where_known(samples, look), where_known(samples, dtau)
+        extra, _ = self.optical.evaluate_segment(Classified(added, dtau), jnp.ones_like(dt))
+        radiance = tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False))
+        return where_known(samples, radiance), where_known(samples, dtau)
 
 
 def _mean(front: Sample, back: Sample) -> Sample:

@@ -1,6 +1,7 @@
 """Radiance transfer: how much of the light from each direction reaches a point through the medium around it (Lindemann and Ropinski 2010,
-sections 4 and 4.1). Here is what of it a scene chooses; `jvr.effects.transfer_nodes` projects it on spherical harmonics at the nodes of a
-coarse grid, `jvr.effects.projected_transfer` is the result, and `jvr.effects.transfer_grid` interpolates it between nodes.
+sections 4 and 4.1). Here is what of it a scene chooses; `jvr.effects.radiance_transfer_nodes` projects it on spherical harmonics at the
+nodes of a coarse grid, `jvr.effects.projected_radiance_transfer` is the result, and `jvr.effects.radiance_transfer_grid` interpolates it
+between nodes.
 """
 
 import dataclasses
@@ -15,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, UInt32
 
-from jvr.effects.projected_transfer import ProjectedTransfer
+from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
 from jvr.model.dipole import Dipole
 from jvr.model.effects import AbstractRadianceTransfer
 from jvr.model.harmonics.basis import count
@@ -29,21 +30,22 @@ LIFT = 1.75
 
 
 class TransferBleeding(eqx.Module):
-    """Rays pick up the transfer function's colour of what they pass: materials may be exchanged without a new projection."""
+    """Colour bleeding of the transfer function's colours, which rays pick up of what they pass: materials may be exchanged without a new
+    projection."""
 
 
 class MaterialBleeding(eqx.Module):
-    """Rays pick up what the material reflects towards their origin, times the transfer function's colour where that tints it: a new
-    material needs a new projection."""
+    """Colour bleeding of what the material reflects towards the origin of a ray, times the transfer function's colour where that tints
+    it: a new material needs a new projection."""
 
 
 class RadianceTransfer(AbstractRadianceTransfer):
-    """Shadows, colour bleeding and scattering of light that comes from all around (`Scene(environment=...)`).
+    """Shadows, colour bleeding and scattering of environment lighting (`Scene(environment=...)`).
 
     Opacities `o` of a node's width of medium, at a node and one node further in all directions, give a surface where the material has a
-    normal: with their change `m` by Sobel's weights it is one by the share `max(o) m^2 / (m^2 + surface^2)`, `solid`. Then rays begin
+    normal: with their change `m` by Sobel's weights it is one by the weight `max(o) m^2 / (m^2 + surface^2)`, `solid`. Then rays begin
     above it, `1.75 solid` nodes along the normal, so that nodes below and above a surface know the same light; what the medium up to
-    there takes is found at each sample (`jvr.effects.own_shadow`). They are sent into the part of the sphere that is not below it: with
+    there takes is found at each sample (`jvr.effects.self_shadow`). They are sent into the part of the sphere that is not below it: with
     `alpha = pi / 2 (1 - solid)`, directions within `pi / 2 + alpha` of the normal are drawn with density `1 / (2 pi (1 + sin alpha))`,
     `rays` of them on a spiral of equal areas, and what they carry is projected on harmonics. The others count as their mean.
 
@@ -55,10 +57,10 @@ class RadianceTransfer(AbstractRadianceTransfer):
     - `bleeding`: `None` (rays carry visibility), `TransferBleeding()` or `MaterialBleeding()` (front-to-back colour, and what remains of
       white light behind it).
     - `scattering`: `jvr.Dipole(...)` or `None`: each node gets the mean of what its neighbours receive, weighted with the dipole's diffuse
-      reflectance; `neighbourhood`: its radius, as a share of the volume's longest side.
-    - `exact`: the triple product of material, light and transfer at each sample. Without it, nodes know which share of the light arrives
-      of all that a matte surface reflects that faces where the medium there does (with a material without normal: of all light), and the
-      sample multiplies that with its own product of material and light. Both are the same where nothing else is in the way.
+      reflectance; `neighbourhood`: its radius, as a fraction of the volume's longest side.
+    - `exact`: the triple product of material, light and radiance transfer at each sample. Without it, nodes know which fraction of the
+      light arrives of all that a diffuse surface reflects that faces where the medium there does (with a material without normal: of all
+      light), and the sample multiplies that with its own product of material and light. Both are the same where nothing else is in the way.
     - `chromaticity`: `None`, or the order to keep colour differences at, where rays carry colour; luminance keeps `order`.
     - `step`, `growth`: first step in voxels, and the ratio of a step to the one before; `termination`: a ray ends once its transmittance
       is at most this.
@@ -83,7 +85,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
     termination: float = eqx.field(static=True)
     surface: float = eqx.field(static=True)
     memory: float = eqx.field(static=True)
-    projected: ProjectedTransfer | None
+    projected: ProjectedRadianceTransfer | None
 
     def __init__(
         self,
@@ -106,10 +108,10 @@ class RadianceTransfer(AbstractRadianceTransfer):
             raise TypeError(f"bleeding must be jvr.TransferBleeding(), jvr.MaterialBleeding() or None, not {bleeding!r}")
         if not isinstance(scattering, Dipole | None):
             raise TypeError(f'scattering must be a jvr.Dipole, such as jvr.Dipole.preset("skin1"), or None, not {scattering!r}')
-        whole = lambda x: isinstance(x, int) and not isinstance(x, bool)
+        is_integer = lambda x: isinstance(x, int) and not isinstance(x, bool)
         wrong = {
-            "order must be a whole number from 0 to 10": not whole(order) or not 0 <= order <= 10,
-            "rays must be a whole number of at least 1": not whole(rays) or rays < 1,
+            "order must be a whole number from 0 to 10": not is_integer(order) or not 0 <= order <= 10,
+            "rays must be a whole number of at least 1": not is_integer(rays) or rays < 1,
             "memory must be a positive number of bytes": not memory > 0,
             "resolution must be above 0 and at most 1 nodes for each voxel": not 0 < resolution <= 1,
             "neighbourhood must be above 0 and at most 1 of the longest side": not 0 < neighbourhood <= 1,
@@ -128,15 +130,15 @@ class RadianceTransfer(AbstractRadianceTransfer):
         self.termination, self.surface = float(termination), float(surface)
         self.bleeding, self.scattering, self.projected = bleeding, scattering, None
 
-    def outdated(self, scene: Any) -> tuple[str, ...]:
-        if self.projected is None or np.all(self.projected.is_for(self.made_for(scene))):
+    def stale(self, scene: Any) -> tuple[str, ...]:
+        if self.projected is None or np.all(self.projected.is_for(self.cache_key(scene))):
             return ()
         return (self._stale,)
 
     def checked(self, scene: Any) -> "RadianceTransfer":
         if self.projected is None:
             return self
-        fits, is_pinned = self.projected.is_for(self.made_for(scene)), self.projected.pinned
+        fits, is_pinned = self.projected.is_for(self.cache_key(scene)), self.projected.pinned
         if isinstance(fits, Tracer):
             if is_pinned:
                 return self
@@ -169,7 +171,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
             else (_changed(self, resolution=self.resolution / 2), _changed(self, rays=max(self.rays // 2, 1)))
         )
 
-    def with_projected(self, projected: ProjectedTransfer) -> "RadianceTransfer":
+    def with_projected(self, projected: ProjectedRadianceTransfer) -> "RadianceTransfer":
         """The same, computed beforehand."""
         return eqx.tree_at(lambda t: t.projected, self, projected, is_leaf=lambda x: x is None)
 
@@ -212,7 +214,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
                 f"a resolution of {fits:.2f} fits, or raise memory"
             )
 
-    def made_for(self, scene: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
+    def cache_key(self, scene: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
         """Checksums of all that a projection depends on."""
         volume = scene.volume
         parts = [volume.values, volume.gaps, volume.slope, volume.intercept, volume.world_from_grid, volume.interpolation]
@@ -224,7 +226,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
         return content((parts, self.scattering if is_scattered else None))
 
     def boundaries(self, shape: tuple[int, int, int]) -> np.ndarray:
-        """Ends of the steps of a ray, as shares of the volume's diameter."""
+        """Ends of the steps of a ray, as fractions of the volume's diameter."""
         across = max(math.sqrt(sum((n - 1) ** 2 for n in shape)), 1.0)
         ends = [0.0]
         while ends[-1] < across:

@@ -6,12 +6,12 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jvr.effects.shading import share_of
+from jvr.effects.shading import surface_weight
 from jvr.model.by_value import ByValue, coefficient
 from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractScattering
 from jvr.model.phase import AbstractPhase, Isotropic, ScatteringAngle
-from jvr.model.ranges import POSITIVE, SHARE, within
+from jvr.model.ranges import POSITIVE, UNIT_INTERVAL, within
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 
@@ -21,16 +21,16 @@ class SingleScattering(AbstractScattering):
     **Arguments:**
 
     - `phase`: a phase function, such as `jvr.HenyeyGreenstein(g)`; a `jvr.ByValue` as its `g` makes it depend on the scalar.
-    - `albedo`: share of extinguished light that is scattered, 0 ... 1; a number, `(3,)`, or `jvr.ByValue`.
+    - `albedo`: fraction of extinguished light that is scattered, 0 ... 1; a number, `(3,)`, or `jvr.ByValue`.
     - `threshold`: with one, light is scattered where the gradient is weak and reflected (`Scene(shading=...)`) where it is strong (notes,
-      section 7.4.4): with a gradient of length `m` the share `threshold^2 / (m^2 + threshold^2)` scatters, and what remains
+      section 7.4.4): with a gradient of length `m` the fraction `threshold^2 / (m^2 + threshold^2)` scatters, and what remains
       reflects. `None`: everything scatters, surface or not.
 
     With lights of unknown intensity, only the product of albedo and intensity can be seen in a picture. Differentiable in all numbers.
     """
 
     phase: AbstractPhase
-    albedo: Any = eqx.field(metadata=within(SHARE))
+    albedo: Any = eqx.field(metadata=within(UNIT_INTERVAL))
     threshold: Scalar | None = eqx.field(metadata=within(POSITIVE))
 
     def __init__(
@@ -43,7 +43,7 @@ class SingleScattering(AbstractScattering):
         if not isinstance(phase, AbstractPhase):
             raise TypeError(f"phase must be a phase function such as jvr.HenyeyGreenstein(0.5), not {type(phase).__name__}")
         self.phase = phase
-        valid, message = SHARE.holds, "albedo must be a share of the extinguished light, 0 to 1"
+        valid, message = UNIT_INTERVAL.holds, "albedo must be a share of the extinguished light, 0 to 1"
         if not isinstance(albedo, ByValue) and np.ndim(albedo) == 1:
             self.albedo = float_array(albedo, "albedo", (3,))
             require(self.albedo, valid, message)
@@ -57,9 +57,9 @@ class SingleScattering(AbstractScattering):
     def needs_gradient(self) -> bool:
         return self.threshold is not None
 
-    def share(self, magnitude: Scalar) -> Scalar:
+    def medium_weight(self, magnitude: Scalar) -> Scalar:
         assert self.threshold is not None
-        return 1 - share_of(magnitude, self.threshold)
+        return 1 - surface_weight(magnitude, self.threshold)
 
     def scatter(self, w_o: Triple, w_i: Triple) -> Channels:
         phase = self.phase.evaluate(ScatteringAngle.between(w_o, w_i))

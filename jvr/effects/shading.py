@@ -24,13 +24,13 @@ EXPONENT = Interval(low=1.0)
 
 
 class Lambert(AbstractShading):
-    """Matte surfaces: `ambient L_ambient + diffuse E max(n . w_i, 0)`, times the colour of the medium.
+    """Diffuse (Lambert) surfaces: `ambient L_ambient + diffuse E max(n . w_i, 0)`, times the colour of the medium.
 
     **Arguments:**
 
     - `ambient`, `diffuse`: numbers, not negative, or `jvr.ByValue` for a material by scalar.
     - `threshold`: length of the gradient (data units per world length) of half a surface: a point with a gradient of length `m` is one
-      by the share `m^2 / (m^2 + threshold^2)`; the rest of it reflects as if it faced the light, so that homogeneous regions are not
+      by the weight `m^2 / (m^2 + threshold^2)`; the rest of it reflects as if it faced the light, so that homogeneous regions are not
       shaded as surfaces. 0: whatever has a gradient is a surface.
     - `two_sided`: the normal is turned to the eye; else the side of larger values is dark.
 
@@ -50,26 +50,26 @@ class Lambert(AbstractShading):
         threshold: ArrayLike = 0.0,
         two_sided: bool = True,
     ):
-        self.ambient = _share(ambient, "ambient")
-        self.diffuse = _share(diffuse, "diffuse")
+        self.ambient = _fraction(ambient, "ambient")
+        self.diffuse = _fraction(diffuse, "diffuse")
         self.threshold = float_array(threshold, "threshold", ())
         require(self.threshold, NOT_NEGATIVE.holds, "threshold must be a length of the gradient, not negative")
         self.two_sided = two_sided
 
-    def ambient_share(self) -> Scalar:
+    def ambient_reflectance(self) -> Scalar:
         return self.ambient
 
-    def surface_share(self, magnitude: Scalar) -> Scalar:
-        return share_of(magnitude, self.threshold)
+    def surface_weight(self, magnitude: Scalar) -> Scalar:
+        return surface_weight(magnitude, self.threshold)
 
-    def reflect(self, share: Scalar, normal: Triple, w_o: Triple, w_i: Triple) -> tuple[Scalar, Scalar | None]:
+    def reflect(self, weight: Scalar, normal: Triple, w_o: Triple, w_i: Triple) -> tuple[Scalar, Scalar | None]:
         normal = self._turned(normal, w_o)
         facing = jnp.maximum(dot(normal, w_i), 0.0)
-        diffuse = self.diffuse * (1 + share * (facing - 1))
-        gloss = self.gloss(normal, w_o, w_i)
-        return diffuse, None if gloss is None else share * jnp.where(facing > 0, gloss, 0.0)
+        diffuse = self.diffuse * (1 + weight * (facing - 1))
+        specular = self.specular_lobe(normal, w_o, w_i)
+        return diffuse, None if specular is None else weight * jnp.where(facing > 0, specular, 0.0)
 
-    def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
+    def specular_lobe(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         """What is reflected in the colour of the light."""
         return None
 
@@ -81,7 +81,7 @@ class Lambert(AbstractShading):
 
 
 class Phong(Lambert):
-    """Glossy surfaces: Lambert's, and `specular E max(r . w_o, 0)^shininess` in the colour of the light, with `r` the mirrored light.
+    """Specular (Phong) surfaces: Lambert's, and `specular E max(r . w_o, 0)^shininess` in the colour of the light, `r` the mirrored light.
 
     **Arguments:** as `Lambert`, and `specular`, not negative; `shininess`, at least 1. Each a number or `jvr.ByValue`.
     """
@@ -100,17 +100,18 @@ class Phong(Lambert):
         two_sided: bool = True,
     ):
         super().__init__(ambient, diffuse, threshold=threshold, two_sided=two_sided)
-        self.specular = _share(specular, "specular")
+        self.specular = _fraction(specular, "specular")
         self.shininess = coefficient(shininess, "shininess", EXPONENT.holds, "shininess must be an exponent of at least 1")
 
-    def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
+    def specular_lobe(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         twice = 2 * dot(normal, w_i)
         mirrored = tuple(twice * n - w for n, w in zip(normal, w_i, strict=True))
         return self.specular * power_of_cosine(mirrored, w_o, self.shininess)
 
 
 class BlinnPhong(Phong):
-    """As `Phong` with `specular E max(n . h, 0)^shininess`, `h` half-way between the directions to eye and light."""
+    """Specular (Blinn-Phong) surfaces: as `Phong` with `specular E max(n . h, 0)^shininess`, `h` half-way between the directions to eye
+    and light."""
 
     # Written out because type checkers take a dataclass's fields for its arguments where it has no constructor of its own.
     def __init__(
@@ -125,19 +126,19 @@ class BlinnPhong(Phong):
     ):
         super().__init__(ambient, diffuse, specular, shininess, threshold=threshold, two_sided=two_sided)
 
-    def gloss(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
+    def specular_lobe(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         half, length = direction_and_length(tuple(o + i for o, i in zip(w_o, w_i, strict=True)))
         return jnp.where(length > 0, self.specular * power_of_cosine(normal, half, self.shininess), 0.0)
 
 
-def share_of(magnitude: Float[Array, "..."], threshold: Scalar) -> Float[Array, "..."]:
+def surface_weight(magnitude: Float[Array, "..."], threshold: Scalar) -> Float[Array, "..."]:
     """`m^2 / (m^2 + t^2)`, by the ratio of the smaller to the larger, so that no square overflows; 0 where `m` is 0."""
     # Where both are the same, one has the derivative of the magnitude and the other that of the threshold.
     ratio = jnp.square(divide_or_zero(smaller(threshold, magnitude), larger(magnitude, threshold)))
-    share = jnp.where(magnitude >= threshold, 1 / (1 + ratio), ratio / (1 + ratio))
+    weight = jnp.where(magnitude >= threshold, 1 / (1 + ratio), ratio / (1 + ratio))
     # A gradient that vanishes has no normal, whatever the threshold.
-    return jnp.where(magnitude > 0, share, jax.lax.stop_gradient(jnp.zeros_like(magnitude)))
+    return jnp.where(magnitude > 0, weight, jax.lax.stop_gradient(jnp.zeros_like(magnitude)))
 
 
-def _share(value: ArrayLike | ByValue, name: str) -> Any:
+def _fraction(value: ArrayLike | ByValue, name: str) -> Any:
     return coefficient(value, name, NOT_NEGATIVE.holds, f"{name} must be finite and not negative")

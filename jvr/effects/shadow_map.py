@@ -20,7 +20,7 @@ LAYERS = 256
 
 
 class ShadowMap(AbstractShadows):
-    """A map of the depth at which each of the light's rays has lost `threshold` of its light: what is behind is dark.
+    """A shadow map: the depth at which each of the light's rays has lost `threshold` of its light: what is behind is dark.
 
     For opaque occluders only. It does not converge to `ShadowRays` in translucent media, whatever the map's size: light is there or not,
     and what is half-way through a cloud has a hard shadow. It has no useful gradient: both depths and comparison are detached, so that
@@ -45,7 +45,7 @@ class ShadowMap(AbstractShadows):
             raise ValueError(f"bias must be a depth in voxels, not negative, not {bias!r}")
         self.texels, self.threshold, self.softness, self.bias = texels, threshold, softness, float(bias)
 
-    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         maps = []
         for light in lights:
             space = light_space(light, scene.volume) if light.casts_shadows else None
@@ -70,15 +70,15 @@ class ShadowMap(AbstractShadows):
 
 
 class DepthMap(eqx.Module):
-    """The depth `w` from which on each ray of a light is dark, infinite where it never is."""
+    """The shadow map of one light: the depth `w` from which on each ray is dark, infinite where it never is."""
 
     space: AbstractLightSpace
     depths: Float[Array, "u v"]
 
-    def lit_share(self, x: Triple, softness: int) -> Scalar:
-        """Share of the texels around a world position whose light reaches it."""
+    def lit_fraction(self, x: Triple, softness: int) -> Scalar:
+        """Fraction of the texels around a world position whose light reaches it."""
         texels, depths = self.depths.shape[0], self.depths.reshape(-1)
-        u, v, w = self.space.place(x)
+        u, v, w = self.space.coordinates(x)
         at = [jnp.clip((c + 1) / 2 * (texels - 1), 0, texels - 1) for c in (u, v)]
         low = [jnp.clip(jnp.floor(c), 0, texels - 2) for c in at]
         fraction = [c - b for c, b in zip(at, low, strict=True)]
@@ -94,7 +94,7 @@ class DepthMap(eqx.Module):
 
 
 class MapVisibility(AbstractVisibility):
-    """A map for each light, or `None` for those that nothing shades."""
+    """Visibility by a shadow map for each light, or `None` for those that nothing shades."""
 
     world_from_grid: Affine
     maps: tuple[DepthMap | None, ...]
@@ -102,8 +102,8 @@ class MapVisibility(AbstractVisibility):
 
     def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
         x = jax.lax.stop_gradient(transformed(self.world_from_grid, points.p))
-        share = lambda depths: jax.vmap(lambda x: depths.lit_share(x, self.softness))(x)
-        return tuple(() if depths is None else (share(depths),) for depths in self.maps)
+        fraction = lambda depths: jax.vmap(lambda x: depths.lit_fraction(x, self.softness))(x)
+        return tuple(() if depths is None else (fraction(depths),) for depths in self.maps)
 
     @property
     def stats(self) -> None:

@@ -20,13 +20,13 @@ from jvr.types import Channels, Scalar
 
 
 class ShadowRays(AbstractShadows):
-    """A ray from every sample to every light, the reference that all other methods approximate.
+    """Shadow rays: one from every sample to every light, the reference that all other methods approximate.
 
     The transmittance is `exp(-tau)` with the optical depth `tau` of the same transfer function, in each of its channels, by the midpoint
     rule from the sample to the light or to where the volume (or its clipping box) ends.
 
     **Arguments:** `step`: length of a segment in voxels of the smallest spacing; `termination`: a shadow ray ends once its transmittance is
-    at most this, which bounds the error. Empty bricks are leapt over, and points without extinction get no ray in pictures.
+    at most this, which bounds the error. Empty bricks are skipped, and points without extinction get no ray in pictures.
 
     Differentiable in transfer function, voxels, lights and pose. Detached: number of segments and termination. Costs about as many samples
     for each sample of the picture as the light's way through the volume has steps.
@@ -42,7 +42,7 @@ class ShadowRays(AbstractShadows):
             raise ValueError(f"termination must be a transmittance in [0, 1), not {termination!r}")
         self.step, self.termination = float(step), float(termination)
 
-    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         return RayVisibility(scene.clipping, lights, medium, self.step * spacing, MarchOptions(self.termination, distance=False))
 
     def coarser(self) -> tuple[AbstractShadows, ...]:
@@ -50,7 +50,7 @@ class ShadowRays(AbstractShadows):
 
 
 class RayVisibility(AbstractVisibility):
-    """Shadow rays through `medium`, which emits nothing."""
+    """Visibility by shadow rays through `medium`, which emits nothing."""
 
     clipping: ClippingBox | None
     lights: tuple[AbstractLight, ...]
@@ -80,11 +80,11 @@ class RayVisibility(AbstractVisibility):
         volume = field.volume
         x = volume.world_from_point(points.p)
         # No light that casts shadows depends on where the eye is.
-        towards, distance, _ = jax.vmap(lambda x: light.arrives(x, x))(x)
-        along = volume.grid_from_world(towards, direction=True)
+        w_i, distance, _ = jax.vmap(lambda x: light.sample(x, x))(x)
+        along = volume.grid_from_world(w_i, direction=True)
         length = smaller(ray_box(points.p, along, *volume.domain)[1], distance)
         if clipping is not None:
-            length = smaller(length, ray_box(x, towards, tuple(clipping.lower), tuple(clipping.upper))[1])
+            length = smaller(length, ray_box(x, w_i, tuple(clipping.lower), tuple(clipping.upper))[1])
         reaches = wanted & (length > 0)
         keep = lambda v: tuple(jnp.where(reaches, c, 0.0) for c in v)
         return Rays(keep(points.p), keep(along), jnp.where(reaches, length, 0.0))

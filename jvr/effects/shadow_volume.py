@@ -37,7 +37,7 @@ class ShadowVolume(AbstractShadows):
             )
         self.resolution = float(resolution)
 
-    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         diagonal = math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape))
         nodes = max(2, math.ceil(self.resolution * diagonal))
         return depth_visibility(scene, lights, medium, nodes + 1, nodes, math.ceil(0.5 / self.resolution))
@@ -47,7 +47,7 @@ class ShadowVolume(AbstractShadows):
 
 
 class OpacityShadowMap(AbstractShadows):
-    """A map of rays with the transmittance at equally distant layers (Kim and Neumann 2001), linear in between.
+    """An opacity shadow map: rays with the transmittance at equally distant layers (Kim and Neumann 2001), linear in between.
 
     **Arguments:** `texels`: rays along each axis of the map; `layers`: of optical depth along each. Detail across the light is kept by the
     texels; between two layers transmittance is a straight line.
@@ -64,7 +64,7 @@ class OpacityShadowMap(AbstractShadows):
         check_size(layers, "layers", 1)
         self.texels, self.layers = texels, layers
 
-    def prepared(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         return depth_visibility(scene, lights, medium, self.texels, self.layers, samples_a_layer(scene, self.layers))
 
     def coarser(self) -> tuple[AbstractShadows, ...]:
@@ -80,13 +80,13 @@ class ClearGrid(eqx.Module):
     def transmittance(self, x: Triple, inside: Bool[Array, "points"]) -> Channels:
         """At a batch of world positions, trilinear. (Not optical depth: behind an opaque surface that is so large that between two nodes
         it would be opaque as well.)"""
-        u, v, w = self.space.place(x)
+        u, v, w = self.space.coordinates(x)
         at = tuple(c * n for c, n in zip((w, (u + 1) / 2, (v + 1) / 2), self.grid.cells, strict=True))
         return self.grid.interpolate(at, inside)
 
 
 class DepthVisibility(AbstractVisibility):
-    """Optical depth from each light, or `None` for those that nothing shades."""
+    """Visibility by optical depth from each light, or `None` for those that nothing shades."""
 
     world_from_grid: Affine
     grids: tuple[ClearGrid | None, ...]
@@ -121,6 +121,6 @@ def samples_a_layer(scene: Scene, layers: int) -> int:
 
 
 def check_size(value: int, name: str, least: int) -> None:
-    """**Raises** `ValueError` unless `value` is a whole number of at least `least`."""
+    """**Raises** `ValueError` unless `value` is an integer of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ValueError(f"{name} must be a whole number of at least {least}, not {value!r}")

@@ -1,1 +1,1 @@
-"""From pictures back to the scene."""
+"""Inverse rendering: from pictures back to the scene."""

@@ -34,7 +34,7 @@ def fingerprint(problem: Problem, observations: Observations, solver: Any) -> Fi
         "images": observations.target,
         "weights": observations.weight,
         "unknowns": problem.unknowns.names,
-        "transforms": problem.unknowns.transforms,
+        "transforms": problem.unknowns.bijectors,
         "exposure": problem.model.exposure,
         "settings": problem.settings,
         "loss": problem.loss,
@@ -42,15 +42,15 @@ def fingerprint(problem: Problem, observations: Observations, solver: Any) -> Fi
         "kept samples": problem.samples is None,
         "solver": solver,
     }
-    return {name: hashlib.sha256(_described(part).encode()).hexdigest()[:16] for name, part in parts.items()}
+    return {name: hashlib.sha256(_canonical(part).encode()).hexdigest()[:16] for name, part in parts.items()}
 
 
-def _described(value: Any, around: tuple[int, ...] = ()) -> str:
+def _canonical(value: Any, around: tuple[int, ...] = ()) -> str:
     """A value in words that are the same in every process: a function is its name, its instructions and what it closes over (the
     optimisers of Optax are nothing else), where `repr` would name a place in memory."""
     if id(value) in around:
         return "itself"
-    inner = functools.partial(_described, around=(*around, id(value)))
+    inner = functools.partial(_canonical, around=(*around, id(value)))
     if eqx.is_array(value) or isinstance(value, np.ndarray | np.generic):
         array = np.asarray(value)
         return f"{array.dtype}{array.shape}{hashlib.sha256(array.tobytes()).hexdigest()}"

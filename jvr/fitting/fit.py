@@ -1,4 +1,4 @@
-"""`jvr.fit`: the scene that explains the images."""
+"""`jvr.fit`: inverse rendering, the arrays of a scene that explain its images."""
 
 import contextlib
 import sys
@@ -16,15 +16,15 @@ import optimistix as optx
 
 from jvr.execution.devices import shares
 from jvr.fitting import checkpoint as checkpoints
-from jvr.fitting.identifiability import Determination, undetermined
+from jvr.fitting.evaluator import Evaluator
+from jvr.fitting.identifiability import Identifiability, undetermined
 from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.minimisers import OptimistixSolver
 from jvr.fitting.objective import Problem, march_unknowns
 from jvr.fitting.observations import Observations, check_images, is_mostly_empty, keep_samples, observe
 from jvr.fitting.solvers import AbstractSolver
-from jvr.fitting.unknowns import Exposed, Unknowns, choose_unknowns
-from jvr.fitting.work import Work
+from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import render
@@ -45,7 +45,7 @@ SHAPE_LIGHT = ("scene.transfer", "scene.volume", "scene.clipping", "scene.materi
 
 class Iteration(NamedTuple):
     """One line of a fit's history: `loss` is the objective, `psnr` in decibels relative to radiance 1 (of the rays in use),
-    `seconds` since the start, `rays` the share of all rays in use."""
+    `seconds` since the start, `rays` the fraction of all rays in use."""
 
     step: int
     loss: float
@@ -59,7 +59,7 @@ class FitStats(NamedTuple):
 
     - `seconds`; `kept_bytes`: of samples kept along the rays, 0 where they were resampled.
     - `residual_variance`, `rank`, `condition`: of the Gauss-Newton matrix at the end, see `jvr.fitting.identifiability`.
-    - `worst`: the worst-determined combination of unknowns, as (name, coefficient), largest first.
+    - `worst`: the least-determined direction of the unknowns, as (name, coefficient), largest first.
     - `held_out`: (PSNR, SSIM) of each held-out view, radiance 0 ... 1.
     """
 
@@ -160,7 +160,7 @@ def fit(
     solver = _as_solver(solver)
     targets = check_images(cameras, images)
     scene = scene.current()
-    model = Exposed(scene, jnp.ones(()) if exposure else None)
+    model = ExposedModel(scene, jnp.ones(()) if exposure else None)
     chosen = _choose(model, unknowns, transforms, solver)
     if any(name.startswith("scene.volume") for name in chosen.names):
         # What the volume keeps would be that of the start.
@@ -169,16 +169,16 @@ def fit(
     if scene.radiance_transfer is not None and any(name.startswith(SHAPE_LIGHT) for name in chosen.names):
         model = eqx.tree_at(lambda m: m.scene.radiance_transfer, model, scene.radiance_transfer.pinned())
     scene, chosen = model.scene, _choose(model, unknowns, transforms, solver)
-    start = chosen.model_from_real(model, chosen.real_from_model(model))
+    start = chosen.model_from_unconstrained(model, chosen.unconstrained_from_model(model))
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
     _check(problem, solver)
 
     observations = observe(scene, cameras, targets, weights, settings)
     chunk = min(CHUNK, -(-observations.size // shares()))
     problem, dealt = _keep(problem, observations.dealt(chunk), chunk, keep_samples)
-    work = Work(problem, dealt, chunk, cameras, targets)
+    evaluator = Evaluator(problem, dealt, chunk, cameras, targets)
     mark = checkpoints.fingerprint(problem, observations, solver) if checkpoint else {}
-    state, history = solver.init(work.functions, chosen.real_from_model(model)), []
+    state, history = solver.init(evaluator.functions, chosen.unconstrained_from_model(model)), []
     if checkpoint and resume and Path(checkpoint).exists():
         state, rows = checkpoints.load(Path(checkpoint), state, mark)
         history = [Iteration(**row) for row in rows]
@@ -187,17 +187,17 @@ def fit(
     outcome = solver.outcome(state)
     with _progress(progress, max_steps) as show:
         while outcome is None and len(history) < max_steps:
-            state = solver.step(work.functions, state)
-            history.append(_iteration(work, solver, state, len(history) + 1, time.perf_counter() - began))
+            state = solver.step(evaluator.functions, state)
+            history.append(_iteration(evaluator, solver, state, len(history) + 1, time.perf_counter() - began))
             if checkpoint:
                 checkpoints.save(Path(checkpoint), state, [entry._asdict() for entry in history], mark)
             show(history[-1])
             outcome = solver.outcome(state)
 
-    real, _ = solver.iterate(state)
-    values = chosen.values_from_real(jnp.asarray(real), model)
+    unconstrained, _ = solver.iterate(state)
+    values = chosen.values_from_unconstrained(jnp.asarray(unconstrained), model)
     found = chosen.insert(model, chosen.split(values, model))
-    known = work.determination(values) if march_unknowns(problem) <= MOST_FORWARD else undetermined(values.size)
+    known = evaluator.identifiability(values) if march_unknowns(problem) <= MOST_FORWARD else undetermined(values.size)
     errors = chosen.split(jnp.asarray(known.standard_errors), model)
     selected, structure = jax.tree.flatten(unknowns(scene))
     stats = FitStats(
@@ -206,7 +206,7 @@ def fit(
         residual_variance=known.variance,
         rank=known.rank,
         condition=known.condition,
-        worst=_worst(chosen, model, known),
+        worst=_least_determined(chosen, model, known),
         held_out=() if held_out is None else _compare(found, settings, *held_out),
     )
     return FitResult(
@@ -230,7 +230,7 @@ def _as_solver(solver: Any) -> AbstractSolver:
     raise TypeError(f"solver must be one of jvr's or Optimistix's, not {type(solver).__name__}")
 
 
-def _choose(model: Exposed, unknowns: Callable[[Scene], Any], transforms: Any, solver: AbstractSolver) -> Unknowns:
+def _choose(model: ExposedModel, unknowns: Callable[[Scene], Any], transforms: Any, solver: AbstractSolver) -> Unknowns:
     """The scene's unknowns and then the exposure."""
     select = lambda m: (unknowns(m.scene), m.exposure)
     if transforms is not None:
@@ -276,24 +276,26 @@ def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool |
     return problem.with_samples(kept[0]), kept[1]
 
 
-def _iteration(work: Work, solver: AbstractSolver, state: Any, step: int, seconds: float) -> Iteration:
-    real, loss = solver.iterate(state)
-    level = int(getattr(state, "level", len(work.levels) - 1))
-    psnr = work.psnr(real, loss, getattr(state, "normal", None))
-    return Iteration(step, loss, psnr, seconds, work.levels[level].size / work.rays)
+def _iteration(evaluator: Evaluator, solver: AbstractSolver, state: Any, step: int, seconds: float) -> Iteration:
+    unconstrained, loss = solver.iterate(state)
+    level = int(getattr(state, "level", len(evaluator.levels) - 1))
+    psnr = evaluator.psnr(unconstrained, loss, getattr(state, "normal", None))
+    return Iteration(step, loss, psnr, seconds, evaluator.levels[level].size / evaluator.rays)
 
 
-def _worst(chosen: Unknowns, model: Exposed, known: Determination, most: int = 6) -> tuple[tuple[str, float], ...]:
-    """The largest coefficients of the worst-determined combination, with the names of their unknowns."""
+def _least_determined(
+    chosen: Unknowns, model: ExposedModel, known: Identifiability, most: int = 6
+) -> tuple[tuple[str, float], ...]:
+    """The largest coefficients of the least-determined direction, with the names of their unknowns."""
     labels = []
     for name, array in zip(chosen.names, chosen.values(model), strict=True):
         labels += [f"{name.removeprefix('scene.')}[{', '.join(map(str, i))}]" for i in np.ndindex(array.shape)]
-    order = np.argsort(-np.abs(known.worst))[:most]
-    return tuple((labels[i], float(known.worst[i])) for i in order)
+    order = np.argsort(-np.abs(known.least_determined))[:most]
+    return tuple((labels[i], float(known.least_determined[i])) for i in order)
 
 
 def _compare(
-    found: Exposed, settings: Settings, cameras: Sequence[AbstractCamera], images: Any
+    found: ExposedModel, settings: Settings, cameras: Sequence[AbstractCamera], images: Any
 ) -> tuple[tuple[float, float], ...]:
     """PSNR and SSIM of views that took no part in the fit."""
     from skimage.metrics import peak_signal_noise_ratio

@@ -1,4 +1,4 @@
-"""How well the images determine the unknowns."""
+"""Identifiability: how well the images determine the unknowns, from the Gauss-Newton matrix."""
 
 from typing import NamedTuple
 
@@ -8,37 +8,37 @@ from jaxtyping import Float
 # Relative rounding of a column of the Jacobian, in units of its number format's epsilon. Positions in a grid of some hundred voxels
 # are rounded to as many units, and the weights of interpolation inherit that. (Against float64 the demo's columns are off by up to 140.)
 ROUNDING = 256
-# Above this share of its square in the null space a value is not determined.
-NULL_SHARE = 1e-4
+# Above this fraction of its square in the null space a value is not determined.
+NULL_FRACTION = 1e-4
 
 
-class Determination(NamedTuple):
-    """Standard errors and what is behind them.
+class Identifiability(NamedTuple):
+    """How well the images determine the unknowns: standard errors and what is behind them.
 
     - `standard_errors`: of each unknown, in its own unit; infinite where the images do not determine it.
     - `variance`: of the residuals, `sum w r^2 / (m - rank)`.
     - `rank`: number of combinations of unknowns that the images determine.
-    - `worst`: the worst-determined combination of the unknowns that are seen at all, one coefficient for each (in units of its own
-      sensitivity), unit length.
+    - `least_determined`: the least-determined direction among the unknowns that are seen at all, one coefficient for each (in units of
+      its own sensitivity), unit length.
     - `condition`: largest over smallest eigenvalue that counts.
     """
 
     standard_errors: Float[np.ndarray, "unknowns"]
     variance: float
     rank: int
-    worst: Float[np.ndarray, "unknowns"]
+    least_determined: Float[np.ndarray, "unknowns"]
     condition: float
 
 
-def undetermined(unknowns: int) -> Determination:
-    """What stands for the determination of unknowns that are too many for their Gauss-Newton matrix: nothing but NaN."""
+def undetermined(unknowns: int) -> Identifiability:
+    """What stands for the identifiability of unknowns that are too many for their Gauss-Newton matrix: nothing but NaN."""
     nothing = np.full(unknowns, np.nan)
-    return Determination(nothing, float("nan"), 0, nothing, float("nan"))
+    return Identifiability(nothing, float("nan"), 0, nothing, float("nan"))
 
 
-def determination(
+def identifiability(
     matrix: Float[np.ndarray, "n n"], squares: float, measurements: int, epsilon: float = float(np.finfo(np.float32).eps)
-) -> Determination:
+) -> Identifiability:
     """Standard errors of a weighted least-squares fit from its Gauss-Newton matrix `sum w J^T J` at the solution.
 
     An unknown with a zero column is seen by no ray. The others are scaled to columns of unit length and the matrix is diagonalised;
@@ -57,12 +57,12 @@ def determination(
     rank = int(counts.sum())
     variance = float(squares) / max(measurements - rank, 1)
     spread = np.square(vectors[:, counts]) @ (1 / eigenvalues[counts])
-    null_share = np.square(vectors[:, ~counts]).sum(axis=1)
-    errors, worst = np.full(diagonal.size, np.inf), np.zeros(diagonal.size)
-    errors[seen] = np.where(null_share > NULL_SHARE, np.inf, np.sqrt(variance * spread) * scale)
-    worst[seen] = vectors[:, 0] if seen.size else 0.0
+    null_fraction = np.square(vectors[:, ~counts]).sum(axis=1)
+    errors, weakest = np.full(diagonal.size, np.inf), np.zeros(diagonal.size)
+    errors[seen] = np.where(null_fraction > NULL_FRACTION, np.inf, np.sqrt(variance * spread) * scale)
+    weakest[seen] = vectors[:, 0] if seen.size else 0.0
     condition = float(eigenvalues[-1] / eigenvalues[counts][0]) if rank else np.inf
-    return Determination(errors, variance, rank, worst, condition)
+    return Identifiability(errors, variance, rank, weakest, condition)
 
 
 def _noise(eigenvalues: Float[np.ndarray, "n"], epsilon: float) -> float:

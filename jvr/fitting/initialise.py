@@ -1,4 +1,4 @@
-"""Where a fit starts."""
+"""Initial values of a fit: a flat transfer function, and the colours that suit given extinctions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from jvr.execution.devices import shares
 from jvr.fitting.losses import SquaredError
 from jvr.fitting.objective import Problem, normal_equations
 from jvr.fitting.observations import check_images, observe
-from jvr.fitting.unknowns import Exposed, choose_unknowns
+from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable, LutTransfer
@@ -48,14 +48,14 @@ def colours_given_extinction(
         raise ValueError(f"colours can be solved for in a table, not in {type(scene.transfer).__name__}")
     targets = check_images(cameras, images)
     colours: Any = lambda scene: scene.transfer.rgb
-    unknowns = choose_unknowns(Exposed(scene, None), lambda m: colours(m.scene))
-    problem = Problem(Exposed(scene, None), unknowns, settings, SquaredError(), (), None)
+    unknowns = choose_unknowns(ExposedModel(scene, None), lambda m: colours(m.scene))
+    problem = Problem(ExposedModel(scene, None), unknowns, settings, SquaredError(), (), None)
     observations = observe(scene, cameras, targets, None, settings)
     chunk = min(16_384, -(-observations.size // shares()))
     start = jnp.ravel(scene.transfer.rgb)
     matrix, vector = np.zeros((start.size,) * 2), np.zeros(start.size)
-    for piece in observations.dealt(chunk).pieces(chunk):
-        normal = normal_equations(problem, start, piece)
+    for tile in observations.dealt(chunk).tiles(chunk):
+        normal = normal_equations(problem, start, tile)
         matrix += np.asarray(normal.matrix, np.float64)
         vector += np.asarray(normal.vector, np.float64)
     scale = max(np.diag(matrix).max(), np.finfo(float).tiny)

@@ -1,7 +1,7 @@
 """Least squares within bounds, over normal equations that were summed in chunks: a matrix of all rays is never held.
 
 With the gradient `g` and the Gauss-Newton matrix `H` of the objective `F`, a step `d` minimises the model `g.d + d.H d / 2` among the
-steps that stay within the bounds of the unknowns and within the reach of each: damped (Levenberg 1944, Marquardt 1963), as it is, or
+steps that stay within the bounds of the unknowns and within the trust region of each: damped (Levenberg 1944, Marquardt 1963), as it is, or
 along Powell's dogleg. Because the step is found there and not cut afterwards, the model never promises more than the step can hold, and an
 unknown at its bound leaves it as soon as the gradient points inwards.
 """
@@ -25,7 +25,7 @@ from jvr.types import Outcome
 
 # With so many rejected steps in a row no direction is left in which float32 can tell a descent from its own rounding.
 MOST_REJECTIONS = 12
-# Sensitivities below this share of the largest count as this share, so that an unknown that no ray sees is not scaled to infinity.
+# Sensitivities below this fraction of the largest count as this fraction, so that an unknown that no ray sees is not scaled to infinity.
 FLOOR = 1e-12
 TINY = 1e-30
 # A ridge under the rounding of the Jacobian, in units of a diagonal of ones, keeps the model convex in directions that no ray sees.
@@ -55,7 +55,7 @@ class Model(NamedTuple):
         return np.clip(found, self.lower, self.upper)
 
     def steepest(self) -> float:
-        """The scaled projected gradient: the largest, over unknowns, of the square root of the share of the objective that moving this
+        """The scaled projected gradient: the largest, over unknowns, of the square root of the fraction of the objective that moving this
         unknown alone within its bounds promises to take away. Away from bounds it is the cosine between the residual and the unknown's
         column of the Jacobian (MINPACK's `gtol`)."""
         diagonal = np.diag(self.matrix)
@@ -87,8 +87,8 @@ class Undamped(AbstractDescent):
 
 
 class AlongDogleg(AbstractDescent):
-    """From the minimum along the gradient towards the minimum of the model, as far as `step_size` allows (Powell 1970). Both lie within the
-    bounds, and so does what is between them."""
+    """The dogleg: from the minimum along the gradient towards the minimum of the model, as far as `step_size` allows (Powell 1970). Both
+    lie within the bounds, and so does what is between them."""
 
     def move(self, model: Model, step_size: float) -> Float[np.ndarray, "n"]:
         cauchy, newton = self._cauchy(model), model.minimum()
@@ -112,9 +112,9 @@ class AlongDogleg(AbstractDescent):
 
 
 class ChunkedState(NamedTuple):
-    """`done`: 0 going on, 1 converged, 2 no finite value, 3 stalled."""
+    """The state of a least-squares solver over chunks. `done`: 0 going on, 1 converged, 2 no finite value, 3 stalled."""
 
-    real: np.ndarray
+    unconstrained: np.ndarray
     loss: np.ndarray
     normal: Normal
     step_size: np.ndarray
@@ -132,8 +132,8 @@ class ChunkedLeastSquares(AbstractSolver):
     Unknowns are scaled so that the Gauss-Newton matrix has a unit diagonal: damping by a multiple of the identity is then Marquardt's.
     A level ends, and the next one with more rays begins, once a step no longer halves the objective. The last level has converged
 
-    - after an accepted step that lowered the objective, and had promised to lower it, by no more than its share `rtol`, where the scaled
-      projected gradient is at most `sqrt(rtol)`: no unknown alone promises more than that share either, or
+    - after an accepted step that lowered the objective, and had promised to lower it, by no more than its fraction `rtol`, where the scaled
+      projected gradient is at most `sqrt(rtol)`: no unknown alone promises more than that fraction either, or
     - where the objective is under the rounding of pictures.
 
     It has stalled after so many rejected steps in a row that rounding decides about them, while the model still promises more. The small
@@ -151,15 +151,15 @@ class ChunkedLeastSquares(AbstractSolver):
     def bounds(self) -> Interval:
         return ANY
 
-    def init(self, functions: Functions, real: Float[Array, "n"]) -> ChunkedState:
-        loss, normal = functions.levels[0](real)
+    def init(self, functions: Functions, unconstrained: Float[Array, "n"]) -> ChunkedState:
+        loss, normal = functions.levels[0](unconstrained)
         done = 0 if np.isfinite(loss) else _NON_FINITE
-        return _state(np.asarray(real), loss, normal, self.first_step_size, 0, 0, done)
+        return _state(np.asarray(unconstrained), loss, normal, self.first_step_size, 0, 0, done)
 
     def step(self, functions: Functions, state: ChunkedState) -> ChunkedState:
         model, scale = _model(functions, state)
         move = self.descent.move(model, float(state.step_size))
-        trial = _within(functions, state.real, scale * move)
+        trial = _within(functions, state.unconstrained, scale * move)
         loss, normal = functions.levels[int(state.level)](jnp.asarray(trial))
         finite = np.isfinite(loss) and all(np.all(np.isfinite(x)) for x in normal)
         with jax.enable_x64(True):
@@ -193,34 +193,34 @@ class ChunkedLeastSquares(AbstractSolver):
         level = int(state.level) + 1
         if level == len(functions.levels):
             return state._replace(done=np.asarray(done))
-        loss, normal = functions.levels[level](jnp.asarray(state.real))
+        loss, normal = functions.levels[level](jnp.asarray(state.unconstrained))
         step_size = max(float(state.step_size), self.first_step_size)
-        return _state(state.real, loss, normal, step_size, level, 0, 0)
+        return _state(state.unconstrained, loss, normal, step_size, level, 0, 0)
 
     def iterate(self, state: ChunkedState) -> tuple[np.ndarray, float]:
-        return state.real, float(state.loss)
+        return state.unconstrained, float(state.loss)
 
     def outcome(self, state: ChunkedState) -> Outcome | None:
         return (None, Outcome.CONVERGED, Outcome.NON_FINITE, Outcome.STALLED)[int(state.done)]
 
 
 def _model(functions: Functions, state: ChunkedState) -> tuple[Model, Float[np.ndarray, "n"]]:
-    """The model about a state, and what a scaled unknown is in units of the real line."""
-    gradient, matrix = functions.quadratic(state.real, state.normal)
+    """The model about a state, and what a scaled unknown is in units of an unconstrained number."""
+    gradient, matrix = functions.quadratic(state.unconstrained, state.normal)
     diagonal = np.diag(matrix)
     scale = 1 / np.sqrt(np.maximum(diagonal, FLOOR * diagonal.max(initial=TINY)))
-    limits = functions.limits(state.real)
-    lower = np.maximum(limits.lower - state.real, -limits.reach) / scale
-    upper = np.minimum(limits.upper - state.real, limits.reach) / scale
+    limits = functions.limits(state.unconstrained)
+    lower = np.maximum(limits.lower - state.unconstrained, -limits.trust_radius) / scale
+    upper = np.minimum(limits.upper - state.unconstrained, limits.trust_radius) / scale
     scaled = scale[:, None] * matrix * scale + RIDGE * np.eye(len(scale))
     # A start at its bound may be rounded to the other side of it.
     return Model(float(state.loss), scale * gradient, scaled, np.minimum(lower, 0.0), np.maximum(upper, 0.0)), scale
 
 
-def _within(functions: Functions, real: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """The point that a step leads to, in the precision of `real`: rounding does not take it out of its bounds."""
-    limits = functions.limits(real)
-    return np.clip(real + move, limits.lower, limits.upper).astype(real.dtype)
+def _within(functions: Functions, unconstrained: np.ndarray, move: np.ndarray) -> np.ndarray:
+    """The point that a step leads to, in the precision of `unconstrained`: rounding does not take it out of its bounds."""
+    limits = functions.limits(unconstrained)
+    return np.clip(unconstrained + move, limits.lower, limits.upper).astype(unconstrained.dtype)
 
 
 def _state(*fields: Any) -> ChunkedState:
@@ -252,7 +252,7 @@ def LevenbergMarquardt(rtol: float = 1e-3) -> ChunkedLeastSquares:
 
 
 def GaussNewton(rtol: float = 1e-3) -> ChunkedLeastSquares:
-    """Undamped Gauss-Newton: fastest near the solution, no guard far from it but the reach of each unknown."""
+    """Undamped Gauss-Newton: fastest near the solution, no guard far from it but the trust region of each unknown."""
     return ChunkedLeastSquares(Undamped(), optx.LearningRate(1.0), rtol)
 
 

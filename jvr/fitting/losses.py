@@ -1,4 +1,4 @@
-"""What a fit makes small: losses over residuals, and priors over the scene."""
+"""Losses over residuals and priors over the scene: what a fit minimises."""
 
 import abc
 
@@ -24,7 +24,7 @@ class AbstractLoss(eqx.Module):
 
 
 class SquaredError(AbstractLoss):
-    """`r^2`."""
+    """The squared error, `r^2`."""
 
     def value(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.square(r)
@@ -34,7 +34,7 @@ class SquaredError(AbstractLoss):
 
 
 class Huber(AbstractLoss):
-    """`r^2` up to `delta`, `2 delta |r| - delta^2` beyond (Huber 1964): outliers pull with a bounded force."""
+    """The Huber loss: `r^2` up to `delta`, `2 delta |r| - delta^2` beyond (Huber 1964): outliers pull with a bounded force."""
 
     delta: float = eqx.field(static=True, default=0.05)
 
@@ -47,7 +47,7 @@ class Huber(AbstractLoss):
 
 
 class AbsoluteError(AbstractLoss):
-    """`sqrt(r^2 + epsilon^2) - epsilon`: `|r|` with its corner rounded, so that it has a derivative at 0."""
+    """The absolute error, `sqrt(r^2 + epsilon^2) - epsilon`: `|r|` with its corner rounded, so that it has a derivative at 0."""
 
     epsilon: float = eqx.field(static=True, default=1e-3)
 
@@ -60,8 +60,8 @@ class AbsoluteError(AbstractLoss):
 
 
 class DSSIM(eqx.Module):
-    """`(1 - SSIM) / 2` of whole images, with a uniform window of `window` pixels (Wang et al. 2004). For solvers that use gradients
-    alone: structural similarity is not a sum over pixels, so it has no Gauss-Newton matrix."""
+    """Structural dissimilarity, `(1 - SSIM) / 2` of whole images, with a uniform window of `window` pixels (Wang et al. 2004). For
+    solvers that use gradients alone: structural similarity is not a sum over pixels, so it has no Gauss-Newton matrix."""
 
     window: int = eqx.field(static=True, default=7)
 
@@ -93,7 +93,7 @@ class AbstractPrior(eqx.Module):
 
 
 class ColourSmoothness(AbstractPrior):
-    """`strength * mean((rgb_i+1 - rgb_i)^2)` over the entries of a table."""
+    """Smoothness of a table's colours: `strength * mean((rgb_i+1 - rgb_i)^2)` over its entries."""
 
     strength: float = eqx.field(static=True)
 
@@ -102,7 +102,8 @@ class ColourSmoothness(AbstractPrior):
 
 
 class ExtinctionSmoothness(AbstractPrior):
-    """`strength * mean((d_i+1 - d_i)^2)`, with `d` the extinction over one voxel, so that the unit of the world does not matter."""
+    """Smoothness of a table's extinction: `strength * mean((d_i+1 - d_i)^2)`, with `d` the extinction over one voxel, so that the unit of
+    the world does not matter."""
 
     strength: float = eqx.field(static=True)
 
@@ -112,7 +113,8 @@ class ExtinctionSmoothness(AbstractPrior):
 
 
 class Sparsity(AbstractPrior):
-    """`strength * mean(d)`, with `d` the extinction over one voxel: what the images do not ask for becomes transparent."""
+    """Sparsity of a table's extinction: `strength * mean(d)`, with `d` the extinction over one voxel: what the images do not ask for
+    becomes transparent."""
 
     strength: float = eqx.field(static=True)
 

@@ -23,26 +23,27 @@ class Scaled(eqx.Module):
     function: Any
     factor: Array
 
-    def __call__(self, real: Float[Array, "n"], args: None) -> tuple[Array, None]:
-        loss, aux = self.function(real, args)
+    def __call__(self, unconstrained: Float[Array, "n"], args: None) -> tuple[Array, None]:
+        loss, aux = self.function(unconstrained, args)
         return loss * self.factor, aux
 
 
 @eqx.filter_jit
-def _factor(function: Any, real: Array) -> Array:
-    loss, _ = function(real, None)
-    return jnp.where(loss > 0, real.size / jnp.where(loss > 0, loss, 1.0), 1.0)
+def _factor(function: Any, unconstrained: Array) -> Array:
+    loss, _ = function(unconstrained, None)
+    return jnp.where(loss > 0, unconstrained.size / jnp.where(loss > 0, loss, 1.0), 1.0)
 
 
 @eqx.filter_jit
-def _value(function: Any, real: Array) -> Array:
-    return function(real, None)[0]
+def _value(function: Any, unconstrained: Array) -> Array:
+    return function(unconstrained, None)[0]
 
 
 class GradientState(NamedTuple):
-    """`inner` is the other library's state; `best` and `best_loss` the best point it has accepted; `factor` that of `Scaled`."""
+    """The state of a gradient solver: `inner` is the other library's state; `best` and `best_loss` the best point it has accepted;
+    `factor` that of `Scaled`."""
 
-    real: Array
+    unconstrained: Array
     inner: Any
     best: Array
     best_loss: Array
@@ -60,12 +61,12 @@ class AbstractGradientSolver(AbstractSolver):
         return (None, Outcome.CONVERGED, Outcome.NON_FINITE)[int(state.done)]
 
 
-def _moved(state: GradientState, real: Array, inner: Any, here: Array, loss: Array, finished: Array) -> GradientState:
-    """The state after a step that ended at `real` and knows the objective `loss` at `here`."""
-    finite = jnp.all(jnp.isfinite(real)) & jnp.isfinite(loss)
+def _moved(state: GradientState, unconstrained: Array, inner: Any, here: Array, loss: Array, finished: Array) -> GradientState:
+    """The state after a step that ended at `unconstrained` and knows the objective `loss` at `here`."""
+    finite = jnp.all(jnp.isfinite(unconstrained)) & jnp.isfinite(loss)
     better = finite & (loss < state.best_loss)
     best, best_loss = jnp.where(better, here, state.best), jnp.where(better, loss, state.best_loss)
-    return GradientState(real, inner, best, best_loss, state.factor, jnp.where(finite, finished.astype(int), 2))
+    return GradientState(unconstrained, inner, best, best_loss, state.factor, jnp.where(finite, finished.astype(int), 2))
 
 
 def _unless_exact(functions: Functions, state: GradientState) -> GradientState:
@@ -74,8 +75,8 @@ def _unless_exact(functions: Functions, state: GradientState) -> GradientState:
     return state._replace(done=jnp.asarray(1)) if exact else state
 
 
-def _begin(real: Array, inner: Any, factor: Array) -> GradientState:
-    return GradientState(real, inner, real, jnp.asarray(jnp.inf, real.dtype), factor, jnp.asarray(0))
+def _begin(unconstrained: Array, inner: Any, factor: Array) -> GradientState:
+    return GradientState(unconstrained, inner, unconstrained, jnp.asarray(jnp.inf, unconstrained.dtype), factor, jnp.asarray(0))
 
 
 class OptimistixSolver(AbstractGradientSolver):
@@ -84,10 +85,10 @@ class OptimistixSolver(AbstractGradientSolver):
 
     solver: optx.AbstractMinimiser | optx.AbstractLeastSquaresSolver
 
-    def init(self, functions: Functions, real: Float[Array, "n"]) -> GradientState:
+    def init(self, functions: Functions, unconstrained: Float[Array, "n"]) -> GradientState:
         whole = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
-        factor = jnp.ones(()) if whole else _factor(functions.value, real)
-        return _begin(real, _init(self.solver, self._function(functions, factor), real), factor)
+        factor = jnp.ones(()) if whole else _factor(functions.value, unconstrained)
+        return _begin(unconstrained, _init(self.solver, self._function(functions, factor), unconstrained), factor)
 
     def step(self, functions: Functions, state: GradientState) -> GradientState:
         return _unless_exact(functions, _step(self.solver, self._function(functions, state.factor), state))
@@ -102,21 +103,21 @@ class OptimistixSolver(AbstractGradientSolver):
 
 
 @eqx.filter_jit
-def _init(solver: Any, fn: Any, real: Array) -> Any:
-    shape, aux = eqx.filter_eval_shape(fn, real, None)
-    return solver.init(fn, real, None, {}, shape, aux, frozenset())
+def _init(solver: Any, fn: Any, unconstrained: Array) -> Any:
+    shape, aux = eqx.filter_eval_shape(fn, unconstrained, None)
+    return solver.init(fn, unconstrained, None, {}, shape, aux, frozenset())
 
 
 @eqx.filter_jit
 def _step(solver: Any, fn: Any, state: GradientState) -> GradientState:
-    real, inner, _ = solver.step(fn, state.real, None, {}, state.inner, frozenset())
-    finished, _ = solver.terminate(fn, real, None, {}, inner, frozenset())
+    unconstrained, inner, _ = solver.step(fn, state.unconstrained, None, {}, state.inner, frozenset())
+    finished, _ = solver.terminate(fn, unconstrained, None, {}, inner, frozenset())
     if isinstance(solver, optx.OptaxMinimiser):
         # Optax moves on from the point that it has just evaluated; the others return the point that they have accepted.
-        return _moved(state, real, inner, state.real, inner.f, finished)
+        return _moved(state, unconstrained, inner, state.unconstrained, inner.f, finished)
     # Least-squares solvers minimise half the squared length.
     half = isinstance(solver, optx.AbstractLeastSquaresSolver)
-    return _moved(state, real, inner, real, inner.f_info.as_min() * (2 if half else 1), finished)
+    return _moved(state, unconstrained, inner, unconstrained, inner.f_info.as_min() * (2 if half else 1), finished)
 
 
 class LBFGSB(AbstractGradientSolver):
@@ -132,27 +133,29 @@ class LBFGSB(AbstractGradientSolver):
     tol: float = eqx.field(static=True, default=1e-6)
     history: int = eqx.field(static=True, default=10)
 
-    def init(self, functions: Functions, real: Float[Array, "n"]) -> GradientState:
-        bounds = _bounds(functions, real)
-        real = jnp.clip(real, *bounds)
-        factor = _factor(functions.value, real)
+    def init(self, functions: Functions, unconstrained: Float[Array, "n"]) -> GradientState:
+        bounds = _bounds(functions, unconstrained)
+        unconstrained = jnp.clip(unconstrained, *bounds)
+        factor = _factor(functions.value, unconstrained)
         scaled = Scaled(functions.value, factor)
-        state = _begin(real, _bounded_init(self.tol, self.history, scaled, real, bounds), factor)
+        state = _begin(unconstrained, _bounded_init(self.tol, self.history, scaled, unconstrained, bounds), factor)
         # Its first step may end at a worse point: the start counts as one that it has accepted.
-        return state._replace(best_loss=_value(scaled, real))
+        return state._replace(best_loss=_value(scaled, unconstrained))
 
     def step(self, functions: Functions, state: GradientState) -> GradientState:
         scaled = Scaled(functions.value, state.factor)
-        return _unless_exact(functions, _bounded_step(self.tol, self.history, scaled, state, _bounds(functions, state.real)))
+        return _unless_exact(
+            functions, _bounded_step(self.tol, self.history, scaled, state, _bounds(functions, state.unconstrained))
+        )
 
     @property
     def bounds(self) -> Interval:
         return Interval(self.lower, self.upper)
 
 
-def _bounds(functions: Functions, real: Array) -> tuple[Array, Array]:
-    limits = functions.limits(np.asarray(real))
-    return jnp.asarray(limits.lower, real.dtype), jnp.asarray(limits.upper, real.dtype)
+def _bounds(functions: Functions, unconstrained: Array) -> tuple[Array, Array]:
+    limits = functions.limits(np.asarray(unconstrained))
+    return jnp.asarray(limits.lower, unconstrained.dtype), jnp.asarray(limits.upper, unconstrained.dtype)
 
 
 def _jaxopt_solver(tol: float, history: int, fn: Any) -> Any:
@@ -160,15 +163,15 @@ def _jaxopt_solver(tol: float, history: int, fn: Any) -> Any:
         # jaxopt announces on import that it is no longer maintained; users of one bounded fit cannot act on that.
         warnings.simplefilter("ignore")
         import jaxopt
-    return jaxopt.LBFGSB(lambda real: fn(real, None)[0], tol=tol, history_size=history)
+    return jaxopt.LBFGSB(lambda unconstrained: fn(unconstrained, None)[0], tol=tol, history_size=history)
 
 
 @eqx.filter_jit
-def _bounded_init(tol: float, history: int, fn: Any, real: Array, bounds: tuple[Array, Array]) -> Any:
-    return _jaxopt_solver(tol, history, fn).init_state(real, bounds)
+def _bounded_init(tol: float, history: int, fn: Any, unconstrained: Array, bounds: tuple[Array, Array]) -> Any:
+    return _jaxopt_solver(tol, history, fn).init_state(unconstrained, bounds)
 
 
 @eqx.filter_jit
 def _bounded_step(tol: float, history: int, fn: Any, state: GradientState, bounds: tuple[Array, Array]) -> GradientState:
-    real, inner = _jaxopt_solver(tol, history, fn).update(state.real, state.inner, bounds)
-    return _moved(state, real, inner, real, inner.value, inner.error <= tol)
+    unconstrained, inner = _jaxopt_solver(tol, history, fn).update(state.unconstrained, state.inner, bounds)
+    return _moved(state, unconstrained, inner, unconstrained, inner.value, inner.error <= tol)

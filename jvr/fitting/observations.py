@@ -1,4 +1,4 @@
-"""Target images as one long list of rays with their target colours, and samples kept along them."""
+"""Observations: target images as one long list of rays with their colours, and samples cached along them."""
 
 import warnings
 from collections.abc import Sequence
@@ -11,20 +11,20 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jvr.execution.devices import everywhere, on_devices, over_rays, shares
-from jvr.march.fields import MISSING, KeptField, VoxelField
+from jvr.march.fields import MISSING, CachedSamples, VoxelField
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
-from jvr.march.steps import Rays, points_at, segment, segment_count
+from jvr.march.steps import Rays, points_at, segment_count, segment_span
 from jvr.model.camera import AbstractCamera
 from jvr.model.exact import Exact
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
 from jvr.numerics import two_sum
 from jvr.pictures import as_radiance
-from jvr.rendering.medium import medium, natural, occupancy, visibility
+from jvr.rendering.medium import environment, medium, occupancy, visibility
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Seen, ahead, enter, near_volume, step_length
+from jvr.rendering.trace import Prepared, ahead, enter, near_volume, step_length
 from jvr.types import Triple
 
 
@@ -58,17 +58,17 @@ class Observations(eqx.Module):
         filled = eqx.tree_at(lambda o: o.weight, filled, filled.weight.at[self.size :].set(0))
         return jax.tree.map(lambda x: x[order.reshape(-1, shares()).T.ravel()], filled)
 
-    def thinned(self, every: int, chunk: int) -> "Observations":
+    def subsampled(self, every: int, chunk: int) -> "Observations":
         """Every `every`-th ray of each share, filled up to whole chunks."""
         each = self.size // shares()
         index = np.arange(0, each, every)
         kept = len(index)
         index = np.pad(index, (0, -kept % chunk))
-        thin = jax.tree.map(lambda x: x.reshape(shares(), each, *x.shape[1:])[:, index], self)
-        thin = eqx.tree_at(lambda o: o.weight, thin, thin.weight.at[:, kept:].set(0))
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), thin)
+        subsample = jax.tree.map(lambda x: x.reshape(shares(), each, *x.shape[1:])[:, index], self)
+        subsample = eqx.tree_at(lambda o: o.weight, subsample, subsample.weight.at[:, kept:].set(0))
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), subsample)
 
-    def pieces(self, chunk: int) -> list["Observations"]:
+    def tiles(self, chunk: int) -> list["Observations"]:
         """One chunk of every share at a time."""
         split = jax.tree.map(lambda x: x.reshape(shares(), -1, chunk, *x.shape[1:]), self)
         of_all = lambda i: jax.tree.map(lambda x: on_devices(x[:, i].reshape(-1, *x.shape[3:])), split)
@@ -85,9 +85,9 @@ class Samples(eqx.Module):
     stride: int = eqx.field(static=True)
     gaps: bool = eqx.field(static=True)
 
-    def along(self, start: Int[Array, "rays"]) -> KeptField:
+    def along(self, start: Int[Array, "rays"]) -> CachedSamples:
         """The samples of rays as a field."""
-        return KeptField(self.stored, start, self.low, self.scale, self.stride, self.gaps)
+        return CachedSamples(self.stored, start, self.low, self.scale, self.stride, self.gaps)
 
     @property
     def bytes(self) -> int:
@@ -172,15 +172,15 @@ def _rays(scene: Scene, camera: AbstractCamera) -> tuple[tuple[Triple, Triple], 
 
 
 @jax.jit
-def _inside(scene: Scene, piece: Observations) -> Rays:
+def _inside(scene: Scene, tile: Observations) -> Rays:
     """The rays inside of the volume, wherever that is in the world."""
     zero = jax.lax.stop_gradient(scene.volume.origin)
     (scene,) = near_volume(scene)
     origin = tuple(
         Exact(high, low).minus(Exact(zero.high[i], zero.low[i])).rounded()
-        for i, (high, low) in enumerate(zip(piece.origin, piece.low, strict=True))
+        for i, (high, low) in enumerate(zip(tile.origin, tile.low, strict=True))
     )
-    return enter(scene, origin, piece.direction, piece.behind)[0]
+    return enter(scene, origin, tile.direction, tile.behind)[0]
 
 
 def keep_samples(
@@ -191,8 +191,8 @@ def keep_samples(
     The error of a kept sample is at most 2^-17 of the range of the volume's values, of those between the ends of a table where these stay
     (`clamped`).
     """
-    pieces = observations.pieces(chunk)
-    counts = [int(_longest(scene, piece, settings)) for piece in pieces]
+    tiles = observations.tiles(chunk)
+    counts = [int(_longest(scene, tile, settings)) for tile in tiles]
     total = chunk * sum(counts)
     if 2 * total * shares() > limit or total >= 2**31:
         return None
@@ -200,9 +200,9 @@ def keep_samples(
     scale = jnp.where(high > low, (high - low) / (MISSING - 1), 1.0)
     stored = np.empty((shares(), total), np.uint16)
     starts, begin = [], 0
-    for piece, count in zip(pieces, counts, strict=True):
+    for tile, count in zip(tiles, counts, strict=True):
         for k in range(count):
-            found = _resample(scene, piece, settings, jnp.int32(k), low, scale)
+            found = _resample(scene, tile, settings, jnp.int32(k), low, scale)
             stored[:, begin + k * chunk : begin + (k + 1) * chunk] = found.reshape(shares(), chunk)
         starts.append(begin + np.arange(chunk, dtype=np.int32))
         begin += chunk * count
@@ -222,50 +222,50 @@ def _kept_range(scene: Scene, clamped: bool) -> tuple[Float[Array, ""], Float[Ar
     return low, high
 
 
-def seen_in_fit(scene: Scene, settings: Settings, leaps: bool, visible: AbstractVisibility | None = None) -> Seen:
-    """What is computed once for all rays; `leaps`: whether rays leap over empty bricks although nothing else is negligible; `visible`: how
+def prepare_in_fit(scene: Scene, settings: Settings, skips: bool, visible: AbstractVisibility | None = None) -> Prepared:
+    """What is computed once for all rays; `skips`: whether rays skip empty bricks although nothing else is negligible; `visible`: how
     much light reaches a point, where that is known."""
     (scene,) = near_volume(scene)
-    where = occupancy(scene, settings) if settings.negligible or leaps else None
-    return Seen(where, visibility(scene, where) if visible is None else visible, natural(scene))
+    occupied = occupancy(scene, settings) if settings.negligible or skips else None
+    return Prepared(occupied, visibility(scene, occupied) if visible is None else visible, environment(scene))
 
 
 def is_mostly_empty(scene: Scene, settings: Settings) -> bool:
     """Whether rays through a scene are better off with a look at its bricks before each sample: half of them are empty."""
-    where = jax.jit(occupancy, static_argnums=1)(scene, settings)
-    return where is not None and float(jnp.mean(where.reach > 0)) >= 0.5
+    occupied = jax.jit(occupancy, static_argnums=1)(scene, settings)
+    return occupied is not None and float(jnp.mean(occupied.empty_radius > 0)) >= 0.5
 
 
 def observed_medium(
-    scene: Scene, piece: Observations, samples: Samples | None, settings: Settings, seen: Seen
+    scene: Scene, tile: Observations, samples: Samples | None, settings: Settings, prepared: Prepared
 ) -> tuple[Medium, Rays]:
-    """What the rays of a piece march through, resampled anew or from kept samples, and the rays inside of it."""
-    rays = _inside(scene, piece)
-    through = medium(near_volume(scene)[0], settings, *seen)
+    """What the rays of a tile march through, resampled anew or from kept samples, and the rays inside of it."""
+    rays = _inside(scene, tile)
+    through = medium(near_volume(scene)[0], settings, *prepared)
     if samples is not None:
-        through = through._replace(field=samples.along(piece.start))
+        through = through._replace(field=samples.along(tile.start))
     return through, rays
 
 
 @eqx.filter_jit
-def _longest(scene: Scene, piece: Observations, settings: Settings) -> Int[Array, ""]:
-    rays = _inside(scene, piece)
+def _longest(scene: Scene, tile: Observations, settings: Settings) -> Int[Array, ""]:
+    rays = _inside(scene, tile)
     return jnp.max(segment_count(rays.length, step_length(scene, settings)))
 
 
 @eqx.filter_jit
-def _resample(scene: Scene, piece: Observations, settings: Settings, k: Int[Array, ""], low: Array, scale: Array) -> Array:
-    def share(shared: tuple[Scene, Array, Array, Array], piece: Observations) -> Array:
+def _resample(scene: Scene, tile: Observations, settings: Settings, k: Int[Array, ""], low: Array, scale: Array) -> Array:
+    def share(shared: tuple[Scene, Array, Array, Array], tile: Observations) -> Array:
         scene, k, low, scale = shared
-        rays, dt = _inside(scene, piece), step_length(scene, settings)
-        _, u = segment(k, segment_count(rays.length, dt), rays.length, dt)
+        rays, dt = _inside(scene, tile), step_length(scene, settings)
+        _, u = segment_span(k, segment_count(rays.length, dt), rays.length, dt)
         found = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
         level = jnp.clip(jnp.round((found.s - low) / scale), 0, MISSING - 1)
         for known in found.known:
             level = jnp.where(known > 0.5, level, MISSING)
         return level.astype(jnp.uint16)
 
-    return everywhere(over_rays(share, (scene, k, low, scale), piece))
+    return everywhere(over_rays(share, (scene, k, low, scale), tile))
 
 
 def _check_weights(cameras: Sequence[AbstractCamera], weights: Sequence[Any] | None, dtype: Any) -> list[np.ndarray]:

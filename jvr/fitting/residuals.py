@@ -1,4 +1,4 @@
-"""`jvr.residuals`: for anyone's own solver."""
+"""`jvr.residuals`: rendered minus target, for anyone's own solver."""
 
 from collections.abc import Sequence
 from typing import Any

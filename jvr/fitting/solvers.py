@@ -1,4 +1,4 @@
-"""What a solver is: it takes one step at a time, so that a fit can show progress, save itself and stop in between."""
+"""The interface of a solver: it takes one step at a time, so that a fit can show progress, save itself and stop in between."""
 
 import abc
 from collections.abc import Callable
@@ -14,21 +14,21 @@ from jvr.types import Outcome
 
 
 class Limits(NamedTuple):
-    """The least and the largest real number for each unknown, and how far each may move in one step."""
+    """The least and the largest unconstrained number for each unknown, and how far each may move in one step."""
 
     lower: Float[np.ndarray, "n"]
     upper: Float[np.ndarray, "n"]
-    reach: Float[np.ndarray, "n"]
+    trust_radius: Float[np.ndarray, "n"]
 
 
 class Functions(NamedTuple):
     """What a solver may ask of a problem.
 
-    - `value(real, None)`: the objective and `None`, differentiable in reverse mode.
-    - `residuals(real, None)`: the whole residual vector, scaled to a squared length of the objective, and `None`; both modes.
-    - `levels`: for each level, from coarse to full, `expand(real)` to `(objective, Normal in own values)`.
-    - `limits(real)`: where the unknowns may go from there.
-    - `quadratic(real, normal)`: gradient and Gauss-Newton matrix on the real line, priors included, in float64.
+    - `value(unconstrained, None)`: the objective and `None`, differentiable in reverse mode.
+    - `residuals(unconstrained, None)`: the whole residual vector, scaled to a squared length of the objective, and `None`; both modes.
+    - `levels`: for each level, from coarse to full, `expand(unconstrained)` to `(objective, Normal in own values)`.
+    - `limits(unconstrained)`: where the unknowns may go from there.
+    - `quadratic(unconstrained, normal)`: gradient and Gauss-Newton matrix in unconstrained space, priors included, in float64.
     - `rounding`: an objective that differs from zero by no more than the rounding of pictures.
     """
 
@@ -49,7 +49,7 @@ class AbstractSolver(eqx.Module):
         """Where it keeps all unknowns, beside their own ranges; then it moves the values themselves. `None`: it knows no bounds."""
 
     @abc.abstractmethod
-    def init(self, functions: Functions, real: Float[Array, "n"]) -> Any:
+    def init(self, functions: Functions, unconstrained: Float[Array, "n"]) -> Any:
         """The state at the start."""
 
     @abc.abstractmethod

@@ -1,4 +1,4 @@
-"""Which arrays of a scene are unknown, and how each lives on the real line while it is fitted."""
+"""Which arrays of a scene are unknown, and how each lives in unconstrained space while it is fitted."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.fitting.transforms import AbstractTransform, transform_of
+from jvr.fitting.bijectors import AbstractBijector, bijector_of
 from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range, range_at, within
 from jvr.model.scene import Scene
 from jvr.types import Scalar
 
 
-class Exposed(eqx.Module):
+class ExposedModel(eqx.Module):
     """A scene and the factor between its radiance and the target images' (`None` where they are in the same unit)."""
 
     scene: Scene
@@ -23,56 +23,58 @@ class Exposed(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """The unknown arrays of a model, by their place in its list of leaves, with a transform for each."""
+    """The unknown arrays of a model, by their index in its list of leaves, with a bijector for each."""
 
-    places: tuple[int, ...] = eqx.field(static=True)
+    indices: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
-    transforms: tuple[AbstractTransform, ...]
+    bijectors: tuple[AbstractBijector, ...]
 
-    def values(self, model: Exposed) -> list[Float[Array, "..."]]:
+    def values(self, model: ExposedModel) -> list[Float[Array, "..."]]:
         """The unknown arrays, each with its own shape."""
         leaves = jax.tree.leaves(model)
-        return [leaves[i] for i in self.places]
+        return [leaves[i] for i in self.indices]
 
-    def insert(self, model: Exposed, values: list[Float[Array, "..."]]) -> Exposed:
+    def insert(self, model: ExposedModel, values: list[Float[Array, "..."]]) -> ExposedModel:
         """The model with other values in place of its unknown arrays."""
         leaves, structure = jax.tree.flatten(model)
-        for i, value in zip(self.places, values, strict=True):
+        for i, value in zip(self.indices, values, strict=True):
             leaves[i] = value.reshape(leaves[i].shape).astype(leaves[i].dtype)
         return jax.tree.unflatten(structure, leaves)
 
-    def split(self, vector: Float[Array, "unknowns"], model: Exposed) -> list[Float[Array, "..."]]:
+    def split(self, vector: Float[Array, "unknowns"], model: ExposedModel) -> list[Float[Array, "..."]]:
         """A flat vector of all unknowns as one array for each."""
         shapes = [value.shape for value in self.values(model)]
         ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
         return [part.reshape(shape) for part, shape in zip(jnp.split(vector, ends[:-1]), shapes, strict=True)]
 
-    def real_from_model(self, model: Exposed) -> Float[Array, "unknowns"]:
-        """The flat vector on the real line that stands for the model's values."""
-        pairs = zip(self.transforms, self.values(model), strict=True)
-        return jnp.concatenate([jnp.ravel(transform.inverse(value)) for transform, value in pairs])
+    def unconstrained_from_model(self, model: ExposedModel) -> Float[Array, "unknowns"]:
+        """The flat vector in unconstrained space that stands for the model's values."""
+        pairs = zip(self.bijectors, self.values(model), strict=True)
+        return jnp.concatenate([jnp.ravel(bijector.inverse(value)) for bijector, value in pairs])
 
-    def values_from_real(self, real: Float[Array, "unknowns"], model: Exposed) -> Float[Array, "unknowns"]:
-        """The flat vector of values for a flat vector on the real line."""
-        pairs = zip(self.transforms, self.split(real, model), strict=True)
-        return jnp.concatenate([jnp.ravel(transform.forward(part)) for transform, part in pairs])
+    def values_from_unconstrained(self, unconstrained: Float[Array, "unknowns"], model: ExposedModel) -> Float[Array, "unknowns"]:
+        """The flat vector of values for a flat vector in unconstrained space."""
+        pairs = zip(self.bijectors, self.split(unconstrained, model), strict=True)
+        return jnp.concatenate([jnp.ravel(bijector.forward(part)) for bijector, part in pairs])
 
-    def limits(self, model: Exposed, real: Float[np.ndarray, "unknowns"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The least and the largest real number of each unknown, and how far it may move from `real` in one step."""
-        parts = [np.atleast_1d(np.asarray(part, np.float64)) for part in self.split(jnp.asarray(real), model)]
-        limits = [(*t.bounds(part), t.reach(part)) for t, part in zip(self.transforms, parts, strict=True)]
-        lower, upper, reach = (np.concatenate([np.ravel(a) for a in arrays]) for arrays in zip(*limits, strict=True))
-        return lower, upper, reach
+    def limits(
+        self, model: ExposedModel, unconstrained: Float[np.ndarray, "unknowns"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The least and the largest unconstrained number of each unknown, and how far it may move from `unconstrained` in one step."""
+        parts = [np.atleast_1d(np.asarray(part, np.float64)) for part in self.split(jnp.asarray(unconstrained), model)]
+        limits = [(*t.bounds(part), t.trust_radius(part)) for t, part in zip(self.bijectors, parts, strict=True)]
+        lower, upper, trust_radius = (np.concatenate([np.ravel(a) for a in arrays]) for arrays in zip(*limits, strict=True))
+        return lower, upper, trust_radius
 
-    def model_from_real(self, model: Exposed, real: Float[Array, "unknowns"]) -> Exposed:
-        """The model whose unknowns are those of `real`."""
-        return self.insert(model, self.split(self.values_from_real(real, model), model))
+    def model_from_unconstrained(self, model: ExposedModel, unconstrained: Float[Array, "unknowns"]) -> ExposedModel:
+        """The model whose unknowns are those of `unconstrained`."""
+        return self.insert(model, self.split(self.values_from_unconstrained(unconstrained, model), model))
 
 
 def choose_unknowns(
-    model: Exposed, select: Callable[[Exposed], Any], transforms: Any = None, bounds: Interval | None = None
+    model: ExposedModel, select: Callable[[ExposedModel], Any], transforms: Any = None, bounds: Interval | None = None
 ) -> Unknowns:
-    """Finds the arrays that `select` returns among the model's own, and a transform for each.
+    """Finds the arrays that `select` returns among the model's own, and a bijector for each.
 
     `select` is called on abstract arrays: it may look at structure and shapes, not at values.
 
@@ -82,29 +84,29 @@ def choose_unknowns(
     **Raises** `ValueError` where an array is not one of the scene's, not floating point, named twice or outside of its range, or the
     number of transforms differs.
     """
-    places = _places(model, select)
+    indices = _indices(model, select)
     leaves = jax.tree_util.tree_leaves_with_path(model)
     named = [(_name(path), leaf) for path, leaf in leaves]
-    for name, array in (named[i] for i in places):
+    for name, array in (named[i] for i in indices):
         if not eqx.is_inexact_array(array):
             raise ValueError(
                 f"{name.removeprefix('scene.')} has integer voxels, which cannot be fitted: convert them to floating point first"
             )
-    names = tuple(named[i][0] for i in places)
-    given = (None,) * len(places) if transforms is None else tuple(transforms)
-    if len(given) != len(places):
+    names = tuple(named[i][0] for i in indices)
+    given = (None,) * len(indices) if transforms is None else tuple(transforms)
+    if len(given) != len(indices):
         raise ValueError(
-            f"there are {len(given)} transforms for {len(places)} unknown arrays ({', '.join(names)}): give one for each"
+            f"there are {len(given)} transforms for {len(indices)} unknown arrays ({', '.join(names)}): give one for each"
         )
     voxel = jnp.min(model.scene.volume.spacing)
 
-    def default(path: Any, value: Array) -> AbstractTransform:
+    def default(path: Any, value: Array) -> AbstractBijector:
         declared = range_at(model, path)
         _check_start(_name(path).removeprefix("scene."), value, declared)
-        return transform_of(declared, value, voxel, bounds)
+        return bijector_of(declared, value, voxel, bounds)
 
-    chosen = tuple(t or default(*leaves[i]) for t, i in zip(given, places, strict=True))
-    return Unknowns(places, names, chosen)
+    chosen = tuple(t or default(*leaves[i]) for t, i in zip(given, indices, strict=True))
+    return Unknowns(indices, names, chosen)
 
 
 def _check_start(name: str, value: Array, declared: Range) -> None:
@@ -117,23 +119,23 @@ def _check_start(name: str, value: Array, declared: Range) -> None:
         )
 
 
-def _places(model: Exposed, select: Callable[[Exposed], Any]) -> tuple[int, ...]:
+def _indices(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> tuple[int, ...]:
     """Where in the model's list of leaves the selected arrays are.
 
     In an abstract model every leaf is an object of its own, also where two fields hold one and the same array.
     """
     leaves, structure = jax.tree.flatten(model)
-    places: list[int | None] = []
+    indices: list[int | None] = []
 
-    def note_places(*abstract: Any) -> None:
-        place = {id(leaf): i for i, leaf in enumerate(abstract)}
-        places.extend(place.get(id(array)) for array in jax.tree.leaves(select(jax.tree.unflatten(structure, abstract))))
+    def note_indices(*abstract: Any) -> None:
+        index = {id(leaf): i for i, leaf in enumerate(abstract)}
+        indices.extend(index.get(id(array)) for array in jax.tree.leaves(select(jax.tree.unflatten(structure, abstract))))
 
-    jax.eval_shape(note_places, *leaves)
-    if not places:
+    jax.eval_shape(note_indices, *leaves)
+    if not indices:
         raise ValueError("unknowns returned no array: name at least one, for example lambda s: s.transfer.rgb")
-    found = tuple(place for place in places if place is not None)
-    if len(found) < len(places):
+    found = tuple(index for index in indices if index is not None)
+    if len(found) < len(indices):
         raise ValueError(
             "unknowns must return arrays of the scene itself, for example lambda s: (s.transfer.rgb, s.transfer.sigma_t)"
         )

@@ -1,4 +1,4 @@
-"""Moving pictures."""
+"""Animated pictures."""
 
 import os
 from collections.abc import Sequence

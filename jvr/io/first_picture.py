@@ -1,4 +1,4 @@
-"""The first picture of somebody's own volume: what of it is shown, in which colours and which light, when nobody has said so.
+"""Defaults for a volume without a configuration: what of it is shown, in which colours and which light.
 
 What is guessed is said in a line each: `FirstPicture.notes`.
 """
@@ -75,7 +75,7 @@ def _says_what_is_up(path: Path) -> bool:
 
 
 @eqx.filter_jit
-def _share_seen(transfer: AbstractTransfer, data: Float[Array, "n"]) -> Float[Array, ""]:
+def _fraction_seen(transfer: AbstractTransfer, data: Float[Array, "n"]) -> Float[Array, ""]:
     seen = lambda s: jnp.max(jnp.asarray(transfer.evaluate(s, jnp.zeros_like(s)).sigma_t)) > 0
     return jnp.mean(jax.vmap(seen)(data))
 
@@ -91,7 +91,7 @@ def _facing(volume: Volume) -> dict[str, str]:
 def what_is_seen(volume: Volume, transfer: AbstractTransfer) -> str | None:
     """A line where a transfer function shows nothing of a volume, or all of it, with the range that would show something."""
     data = _subset(volume)
-    share = float(_share_seen(transfer, jnp.asarray(data, jnp.result_type(float))))
+    share = float(_fraction_seen(transfer, jnp.asarray(data, jnp.result_type(float))))
     if 0 < share < 0.98 or transfer.takes_gradient:
         return None
     low, high = contents(volume)

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Array
 
 from jvr.atomic import replacing
-from jvr.effects.projected_transfer import ProjectedTransfer
+from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
 from jvr.effects.radiance_transfer import MaterialBleeding
-from jvr.effects.transfer_grid import TransferProjection, finished, project_all, transfer_of
+from jvr.effects.radiance_transfer_grid import RadianceTransferProjection, finished, project_all, radiance_transfer_of
 from jvr.execution.devices import everywhere, over_rays, shares
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
@@ -85,14 +85,17 @@ def precompute(
     if scene.radiance_transfer is None:
         return scene
     if scene.radiance_transfer.is_frozen:
-        if not scene.radiance_transfer.outdated(scene):
+        if not scene.radiance_transfer.stale(scene):
             return scene
         scene = eqx.tree_at(lambda s: s.radiance_transfer.projected, scene, None)
-    transfer = transfer_of(scene)
-    if keep_unscattered and transfer.scattering is not None:
+    radiance_transfer = radiance_transfer_of(scene)
+    if keep_unscattered and radiance_transfer.scattering is not None:
         scene = eqx.tree_at(lambda s: s.radiance_transfer.scattering, scene, None)
     # The light plays no part, and the material where rays do not pick up its colour none but that it has a normal.
-    plays, normal = isinstance(transfer.bleeding, MaterialBleeding), scene.material is not None and scene.material.needs_gradient
+    plays, normal = (
+        isinstance(radiance_transfer.bleeding, MaterialBleeding),
+        scene.material is not None and scene.material.needs_gradient,
+    )
     inputs = (
         _bare(scene.volume),
         scene.transfer,
@@ -105,7 +108,7 @@ def precompute(
     projected = _kept(
         folder, whole, inputs, lambda: _project(scene, progress or (lambda share: None)), "radiance transfer", report
     )
-    return dataclasses.replace(scene, radiance_transfer=transfer.with_projected(projected))
+    return dataclasses.replace(scene, radiance_transfer=radiance_transfer.with_projected(projected))
 
 
 _projected = jax.jit(lambda material, order: material.projected(order), static_argnums=1)
@@ -134,7 +137,7 @@ def as_precomputed(scene: Scene) -> Scene:
     scene = dataclasses.replace(scene, material=zeros[0])
     if zeros[1] is None:
         return scene
-    return dataclasses.replace(scene, radiance_transfer=transfer_of(scene).with_projected(zeros[1]))
+    return dataclasses.replace(scene, radiance_transfer=radiance_transfer_of(scene).with_projected(zeros[1]))
 
 
 def _material_order(scene: Scene) -> int:
@@ -142,15 +145,17 @@ def _material_order(scene: Scene) -> int:
     return max(scene.material_order, LEAST_ORDER)
 
 
-def _projection(scene: Scene) -> TransferProjection:
+def _projection(scene: Scene) -> RadianceTransferProjection:
     """What the nodes of a scene are projected with."""
-    transfer = transfer_of(scene)
+    radiance_transfer = radiance_transfer_of(scene)
     where = occupancy(scene, Settings())
-    return TransferProjection.of(scene, absorbing(scene, where, scene.transfer.takes_gradient or transfer.needs_gradient))
+    return RadianceTransferProjection.of(
+        scene, absorbing(scene, where, scene.transfer.takes_gradient or radiance_transfer.needs_gradient)
+    )
 
 
-def _project(scene: Scene, progress: Progress) -> ProjectedTransfer:
-    """The transfer of all nodes near which there is something to see, some at a time."""
+def _project(scene: Scene, progress: Progress) -> ProjectedRadianceTransfer:
+    """The radiance transfer of all nodes near which there is something to see, some at a time."""
     projection = jax.jit(_projection)(scene)
     active = np.flatnonzero(np.asarray(projection.active()))
     shape = jax.eval_shape(project_all, projection)
@@ -167,8 +172,8 @@ def _project(scene: Scene, progress: Progress) -> ProjectedTransfer:
 
 
 @jax.jit
-def _some(projection: TransferProjection, index: Array) -> tuple[Array, Array]:
-    """The transfer of some nodes."""
+def _some(projection: RadianceTransferProjection, index: Array) -> tuple[Array, Array]:
+    """The radiance transfer of some nodes."""
     return everywhere(over_rays(lambda projection, index: projection.nodes(index), projection, index))
 
 

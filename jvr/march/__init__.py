@@ -1,1 +1,1 @@
-"""How one ray becomes radiance, for a whole batch of rays at a time."""
+"""Ray marching: how rays become radiance, a whole batch at a time, and the derivatives of that."""

@@ -1,4 +1,4 @@
-"""Reverse mode through a march, by replaying it.
+"""The replay adjoint: reverse mode through a march, by replaying it back to front.
 
 The segments of every ray are walked a second time, back to front, so that nothing is stored for a step. With `B` the radiance from
 behind a segment as it leaves the next one, `B <- e + exp(-dtau) B`, and `T` the transmittance in front of the segment,
@@ -9,7 +9,7 @@ Nothing is divided by a transparency that may be zero, and nothing is found as t
 what was emitted, so entries deep behind a bright front keep their digits. (Walking front to back and subtracting each contribution
 from the final radiance loses them: the compiler need not round both walks alike.) The optical depth in front of a segment is that in
 front of the next one less its own. A segment may be arbitrarily opaque, which would leave no digit of such a difference: the forward
-march notes, for each channel, the depth in front of the last segment that can be seen through, and differences start there.
+march records, for each channel, the depth in front of the last segment that can be seen through, and differences start there.
 
 What a segment's `e` and `dtau` depend on is left to automatic differentiation of that one segment.
 """
@@ -22,14 +22,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.batch import pooled_while
-from jvr.march.march import Marched, MarchOptions, Noted, integrate, march
+from jvr.march.march import Marched, MarchOptions, ReplayRecord, integrate, march
 from jvr.march.medium import Medium, for_derivatives
 from jvr.march.rules import is_zero, wanted_and_fixed, with_zeros
-from jvr.march.segments import Lanes, Stretch, lanes_of, lit, places, resample, shown
-from jvr.march.steps import Rays, Sample, points_at, segment
+from jvr.march.segments import ActiveRays, SegmentBatch, active_rays, node_points, occupied_count, resample, with_lighting
+from jvr.march.steps import Rays, Sample, points_at, segment_span
 from jvr.march.sums import opacity, through, transmittance
-from jvr.numerics import computed_once, one_minus_exp, two_sum
+from jvr.march.wavefront import wavefront_while
+from jvr.numerics import materialise, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
 
@@ -40,16 +40,16 @@ def replay_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) 
 
 def _replay_forward(options: MarchOptions, *arguments: Any):
     wanted, fixed = wanted_and_fixed(arguments)
-    gathered, noted = integrate(options, *eqx.combine(wanted, fixed), for_replay=True)
-    return gathered, (wanted, fixed, noted)
+    gathered, record = integrate(options, *eqx.combine(wanted, fixed), for_replay=True)
+    return gathered, (wanted, fixed, record)
 
 
 def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
     if all(map(is_zero, cotangent.distance)):
         # Nobody asks for the derivative of the distance: it is then not replayed either.
         cotangent = cotangent._replace(distance=())
-    wanted, fixed, noted = residuals
-    return replay(wanted, fixed, noted, with_zeros(cotangent)._replace(steps=None))
+    wanted, fixed, record = residuals
+    return replay(wanted, fixed, record, with_zeros(cotangent)._replace(steps=None))
 
 
 replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
@@ -58,9 +58,9 @@ replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
 Inputs = tuple[Medium, Rays, Scalar]
 
 
-class Behind(NamedTuple):
-    """What a segment has behind it: radiance and opacity-weighted distance as they leave the next segment, and the optical depth from
-    the entry to there as a sum of two floats."""
+class SuffixRadiance(NamedTuple):
+    """The suffix of a ray behind a segment: radiance and opacity-weighted distance as they leave the next segment, and the optical depth
+    from the entry to there as a sum of two floats."""
 
     radiance: Channels
     distance: Channels
@@ -68,41 +68,41 @@ class Behind(NamedTuple):
     tau_low: Channels
 
 
-class BackLanes(NamedTuple):
-    """A batch of rays that are walked backwards, from segment `steps - 1` on; `front` and `last` are those of the forward march's
-    `Noted`."""
+class BackwardRays(NamedTuple):
+    """Rays of a wavefront that are walked backwards, from segment `steps - 1` on; `front` and `last` are those of the forward march's
+    `ReplayRecord`."""
 
-    lanes: Lanes
+    active: ActiveRays
     steps: Int[Array, "rays"]
     front: Channels
     last: tuple[Int[Array, "rays"], ...]
 
     def at(self, j: Int[Array, "rays"]) -> tuple[Int[Array, "rays"], Int[Array, "rays"]]:
         """The index of the `j`-th segment from the back, and the number of segments, 0 for rays that are done."""
-        return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.lanes.segments, 0)
+        return jnp.maximum(self.steps - 1 - j, 0), jnp.where(j < self.steps, self.active.segments, 0)
 
-    def leap(self, medium: Medium, dt: Scalar, j: Int[Array, "rays"]) -> Int[Array, "rays"]:
+    def skip(self, medium: Medium, dt: Scalar, j: Int[Array, "rays"]) -> Int[Array, "rays"]:
         """The next segment from the back, from the `j`-th on, whose midpoint may lie in a visible brick, or the number of them."""
         if medium.occupancy is None:
             return j
-        rays = self.lanes.rays
-        extent, u = segment(jnp.maximum(self.steps - 1 - j, 0), self.lanes.segments, rays.length, dt)
-        within = len(medium.shader.places) > 1
+        rays = self.active.rays
+        extent, u = segment_span(jnp.maximum(self.steps - 1 - j, 0), self.active.segments, rays.length, dt)
+        within = len(medium.shader.quadrature_nodes) > 1
         first = u + extent / 2 if within else u
-        return jnp.minimum(j + medium.occupancy.leap(rays, first, dt, backwards=True, within=within), self.steps)
+        return jnp.minimum(j + medium.occupancy.skip(rays, first, dt, backwards=True, within=within), self.steps)
 
-    def nothing_behind(self, emits: int, *, distance: bool) -> Behind:
-        """What the last segment has behind it."""
-        zero = jnp.zeros_like(self.lanes.rays.length)
+    def empty_suffix(self, emits: int, *, distance: bool) -> SuffixRadiance:
+        """The suffix behind the last segment."""
+        zero = jnp.zeros_like(self.active.rays.length)
         blank = (zero,) * len(self.front)
-        return Behind((zero,) * emits, blank * distance, self.front, blank)
+        return SuffixRadiance((zero,) * emits, blank * distance, self.front, blank)
 
-    def depth(self, j: Int[Array, "rays"], behind: Behind, dtau: Channels) -> tuple[Channels, Channels]:
+    def depth(self, j: Int[Array, "rays"], suffix: SuffixRadiance, dtau: Channels) -> tuple[Channels, Channels]:
         """Optical depth in front of the `j`-th segment from the back, whose own is `dtau`: infinite where nothing behind can be seen,
-        given where the forward march has noted it, else that in front of the next segment less its own."""
+        given where the forward march has recorded it, else that in front of the next segment less its own."""
         k, channels = self.steps - 1 - j, []
-        for front, last, high, low, d in zip(self.front, self.last, behind.tau, behind.tau_low, dtau, strict=True):
-            # What was noted holds in front of segment `last` and, where that was leapt over, behind the first one that is reached.
+        for front, last, high, low, d in zip(self.front, self.last, suffix.tau, suffix.tau_low, dtau, strict=True):
+            # What was recorded holds in front of segment `last` and, where that was skipped, behind the first one that is reached.
             first = jnp.isinf(high)
             high, low = jnp.where(first, front, high), jnp.where(first, 0.0, low)
             high, low = two_sum(high, low, jnp.where(k < last, -d, 0.0))
@@ -111,32 +111,32 @@ class BackLanes(NamedTuple):
 
 
 def step_back(
-    behind: Behind, front: tuple[Channels, Channels], emitted: Channels, dtau: Channels, u: Float[Array, "rays"]
-) -> Behind:
-    """What the segment in front has behind it."""
+    suffix: SuffixRadiance, front: tuple[Channels, Channels], emitted: Channels, dtau: Channels, u: Float[Array, "rays"]
+) -> SuffixRadiance:
+    """The suffix behind the segment in front."""
     clear = tuple(jnp.exp(-d) for d in dtau)
-    radiance = tuple(e + b for e, b in zip(emitted, through(clear, behind.radiance), strict=True))
-    distance = tuple(one_minus_exp(d) * u + c * b for d, c, b in zip(dtau, clear, behind.distance, strict=False))
-    return Behind(radiance, distance, *front)
+    radiance = tuple(e + b for e, b in zip(emitted, through(clear, suffix.radiance), strict=True))
+    distance = tuple(one_minus_exp(d) * u + c * b for d, c, b in zip(dtau, clear, suffix.distance, strict=False))
+    return SuffixRadiance(radiance, distance, *front)
 
 
-def segment_cotangents(cotangent: Marched, behind: Behind, before: Channels, dtau: Channels, u: Float[Array, "rays"]):
+def segment_cotangents(cotangent: Marched, suffix: SuffixRadiance, before: Channels, dtau: Channels, u: Float[Array, "rays"]):
     """Cotangents of one segment's emission, optical depth and distance (the equations at the top of this file)."""
     after = tuple(T * jnp.exp(-d) for T, d in zip(before, dtau, strict=True))
-    pulled = [-g * b for g, b in zip(cotangent.radiance, through(after, behind.radiance), strict=True)]
+    pulled = [-g * b for g, b in zip(cotangent.radiance, through(after, suffix.radiance), strict=True)]
     n = len(dtau)
     to_dtau = [sum(pulled[c::n], cotangent.tau[c]) for c in range(n)]
     to_u = jnp.zeros_like(u)
-    for c, (g, b) in enumerate(zip(cotangent.distance, behind.distance, strict=True)):
+    for c, (g, b) in enumerate(zip(cotangent.distance, suffix.distance, strict=True)):
         to_dtau[c] += g * after[c] * (u - b)
         to_u += g * opacity(before, dtau)[c]
     return through(before, cotangent.radiance), tuple(to_dtau), to_u
 
 
 class _ReplayState(NamedTuple):
-    """What a ray has behind it, how many segments were replayed, and the gradient with respect to the ray."""
+    """The suffix of a ray, how many segments were replayed, and the gradient with respect to the ray."""
 
-    behind: Behind
+    suffix: SuffixRadiance
     j: Int[Array, "rays"]
     gradient: Any
 
@@ -148,60 +148,60 @@ class _Gradients(NamedTuple):
     dt: Any
 
 
-def replay(wanted: Any, fixed: Any, noted: Noted, cotangent: Marched) -> Any:
+def replay(wanted: Any, fixed: Any, record: ReplayRecord, cotangent: Marched) -> Any:
     """The gradient of `<cotangent, march>` with respect to the leaves of `wanted` that are not `None`.
 
-    **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `noted`: by the forward march.
+    **Arguments:** `wanted`, `fixed`: the march's inputs, each leaf in one of them; `record`: by the forward march.
     """
     medium, rays, dt = eqx.combine(wanted, fixed)
     medium = for_derivatives(medium, wanted[0], wanted[1:])
     rays_mask = is_there(wanted[1])
     zeros = functools.partial(jax.tree.map, jnp.zeros_like)
 
-    def start(inputs: tuple[BackLanes, Marched]) -> _ReplayState:
+    def start(inputs: tuple[BackwardRays, Marched]) -> _ReplayState:
         back, cotangent = inputs
-        behind = back.nothing_behind(len(cotangent.radiance), distance=bool(cotangent.distance))
-        return _ReplayState(behind, jnp.zeros_like(back.steps), zeros(eqx.filter(back.lanes.rays, rays_mask)))
+        suffix = back.empty_suffix(len(cotangent.radiance), distance=bool(cotangent.distance))
+        return _ReplayState(suffix, jnp.zeros_like(back.steps), zeros(eqx.filter(back.active.rays, rays_mask)))
 
-    def alive(inputs: tuple[BackLanes, Marched], state: _ReplayState):
+    def alive(inputs: tuple[BackwardRays, Marched], state: _ReplayState):
         return state.j < inputs[0].steps
 
-    def advance(inputs: tuple[BackLanes, Marched], state: _ReplayState, total: _Gradients):
+    def advance(inputs: tuple[BackwardRays, Marched], state: _ReplayState, total: _Gradients):
         return _replay_segment(medium, dt, *inputs, state, total)
 
-    inputs = (BackLanes(lanes_of(rays, dt), *noted), cotangent)
+    inputs = (BackwardRays(active_rays(rays, dt), *record), cotangent)
     total = _Gradients(zeros(wanted[0]), zeros(wanted[2]))
-    gradient, total = pooled_while(alive, advance, start, lambda state: state.gradient, inputs, total, noted.following)
+    gradient, total = wavefront_while(alive, advance, start, lambda state: state.gradient, inputs, total, record.following)
     return total.medium, gradient, total.dt
 
 
-def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marched, state: _ReplayState, total: _Gradients):
-    state = state._replace(j=back.leap(medium, dt, state.j))
-    lanes, (k, count) = back.lanes, back.at(state.j)
-    count = shown(medium, lanes, dt, k, count)
+def _replay_segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangent: Marched, state: _ReplayState, total: _Gradients):
+    state = state._replace(j=back.skip(medium, dt, state.j))
+    active, (k, count) = back.active, back.at(state.j)
+    count = occupied_count(medium, active, dt, k, count)
     # The field is not among `small`: it deposits its derivative itself, in place, through the tap.
     small_mask = is_there((total.medium.transfer, total.medium.shader, total.medium.shadows, state.gradient, total.dt))
-    small, rest = eqx.partition((medium.transfer, medium.shader, medium.shadows, lanes.rays, dt), small_mask)
+    small, rest = eqx.partition((medium.transfer, medium.shader, medium.shadows, active.rays, dt), small_mask)
 
     def local(small: Any, taps: tuple[Sample, ...]):
         """The segment as a function of what its derivative is wanted for; the taps stand for the field."""
         transfer, shader, shadows, rays, dt = eqx.combine(small, rest)
-        extent, u = segment(k, count, rays.length, dt)
-        sampled = places(medium, rays, lanes.ray, k, u, extent)
+        extent, u = segment_span(k, count, rays.length, dt)
+        sampled = node_points(medium, rays, active.ray, k, u, extent)
         samples = jax.tree.map(jnp.add, resample(medium, sampled, k < count), taps)
-        where = Stretch(rays, lanes.ray, k, u, extent, k < count)
+        batch = SegmentBatch(rays, active.ray, k, u, extent, k < count)
         # Light moves with the extinction, of which it knows as the shader does.
         moved = medium._replace(transfer=transfer, shader=shader, shadows=shadows)
-        samples = lit(moved, where, samples, reverse=True)
-        point = points_at(rays, lanes.ray, k, u)
-        looks = jax.vmap(shader.look, in_axes=(None, 0, 0, 0))(transfer, samples, point, extent)
-        return (*computed_once(k < count, looks), u), sampled
+        samples = with_lighting(moved, batch, samples, reverse=True)
+        point = points_at(rays, active.ray, k, u)
+        found = jax.vmap(shader.evaluate_segment, in_axes=(None, 0, 0, 0))(transfer, samples, point, extent)
+        return (*materialise(k < count, found), u), sampled
 
-    (emitted, dtau, u), pull, sampled = jax.vjp(local, small, _no_taps(medium, lanes.rays), has_aux=True)
+    (emitted, dtau, u), pull, sampled = jax.vjp(local, small, _no_taps(medium, active.rays), has_aux=True)
 
-    front = back.depth(state.j, state.behind, dtau)
+    front = back.depth(state.j, state.suffix, dtau)
     before = transmittance(*front)
-    small_gradient, cotangents = pull(segment_cotangents(cotangent, state.behind, before, dtau, u))
+    small_gradient, cotangents = pull(segment_cotangents(cotangent, state.suffix, before, dtau, u))
 
     # A ray that is done has no derivative, whatever the voxel that it reads.
     on = state.j < back.steps
@@ -210,20 +210,20 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackLanes, cotangent: Marc
         jnp.add, (total.medium.transfer, total.medium.shader, total.medium.shadows, state.gradient, total.dt), small_gradient
     )
     # Else the whole computation of the cotangent is repeated in each of the scattered additions, which then take three times as long.
-    cotangents = computed_once(on, cotangents)
+    cotangents = materialise(on, cotangents)
     field = total.medium.field
     for points, of_sample in zip(sampled, cotangents, strict=True):
         field = medium.field.deposit(field, points, of_sample)
-    behind = step_back(state.behind, front, emitted, dtau, u)
-    state = _ReplayState(behind, state.j + on, ray_gradient)
+    suffix = step_back(state.suffix, front, emitted, dtau, u)
+    state = _ReplayState(suffix, state.j + on, ray_gradient)
     return state, _Gradients(Medium(field, transfer, shader, total.medium.occupancy, shadows), dt_gradient)
 
 
 def _no_taps(medium: Medium, rays: Rays) -> tuple[Sample, ...]:
-    """Zero for everything that is resampled at the places of a segment."""
+    """Zero for everything that is resampled at the quadrature nodes of a segment."""
     points = points_at(rays, jnp.zeros_like(rays.length, jnp.int32), jnp.int32(0), rays.length)
     one = jax.eval_shape(lambda: jax.vmap(medium.field.resample)(points))
-    return (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one),) * len(medium.shader.places)
+    return (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one),) * len(medium.shader.quadrature_nodes)
 
 
 def is_there(tree: Any) -> Any:

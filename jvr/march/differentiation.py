@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from jvr.march.adjoint import Inputs, is_there, replay_march
+from jvr.march.jacobian import TableJacobian, table_jacobian
 from jvr.march.march import Marched, MarchOptions, march
 from jvr.march.medium import Medium, taking_all
-from jvr.march.rows import TableRows, table_rows
 from jvr.march.rules import is_zero
 from jvr.march.steps import Rays
 from jvr.model.transfer import AbstractTable, AbstractTransfer
@@ -19,7 +19,7 @@ from jvr.types import Scalar
 
 
 class AbstractAdjoint(eqx.Module):
-    """A way to differentiate a march."""
+    """An adjoint: a way to differentiate a march."""
 
     @abc.abstractmethod
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
@@ -45,7 +45,7 @@ class Forward(AbstractAdjoint):
 
 
 class Rows(AbstractAdjoint):
-    """Forward and reverse mode and any nesting with `vmap`, for few unknowns.
+    """The per-ray Jacobian: forward and reverse mode and any nesting with `vmap`, for few unknowns.
 
     The derivative of each ray with respect to every perturbed array is computed once and held, `rays x unknowns` numbers; a
     tangent is that matrix times a direction. Entries of a table come out of one replay, with hat functions, at about the cost of a
@@ -53,15 +53,15 @@ class Rows(AbstractAdjoint):
     """
 
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
-        return _rows_march(options, medium, rays, dt)
+        return _jacobian_march(options, medium, rays, dt)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _rows_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Any:
+def _jacobian_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Any:
     return march(options, medium, rays, dt)
 
 
-def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[Marched, Marched]:
+def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[Marched, Marched]:
     perturbed = jax.tree.map(lambda t, x: not is_zero(t) and eqx.is_inexact_array(x), tangents, primals, is_leaf=is_zero)
     tangents = eqx.filter(tangents, perturbed)
     medium, rays, dt = primals
@@ -75,7 +75,7 @@ def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[M
     if options.distance or not jax.tree.leaves(entries):
         primal, tangent = march(options, *primals), None
     else:
-        primal, rows = table_rows(options, medium, rays, dt, of_extinctions=entries.sigma_t is not None)
+        primal, rows = table_jacobian(options, medium, rays, dt, of_extinctions=entries.sigma_t is not None)
         tangents = (tangents[0]._replace(transfer=rest_of_transfer), *tangents[1:])
         tangent = _times_entries(rows, entries)
     if jax.tree.leaves(tangents):
@@ -87,7 +87,7 @@ def _rows_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[M
     return primal, tangent._replace(steps=steps)
 
 
-_rows_march.defjvp(_rows_rule, symbolic_zeros=True)
+_jacobian_march.defjvp(_jacobian_rule, symbolic_zeros=True)
 
 
 def _split_entries(tree: AbstractTransfer) -> tuple[Any, Any]:
@@ -100,7 +100,7 @@ def _split_entries(tree: AbstractTransfer) -> tuple[Any, Any]:
     return rest, entries
 
 
-def _times_entries(rows: TableRows, tangent: Any) -> Marched:
+def _times_entries(rows: TableJacobian, tangent: Any) -> Marched:
     """Rows of a table times a direction in its entries."""
     rgb, sigma_t = tangent.rgb, tangent.sigma_t
     sigma_column = lambda c: sigma_t if sigma_t.ndim == 1 else sigma_t[:, c]

@@ -1,4 +1,4 @@
-"""The fields that rays can march through: voxels, resampled at every point, or samples kept from an earlier march."""
+"""The fields that rays can march through: voxels, resampled at every point, or samples cached by an earlier march."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from jvr.model.normals import AbstractNormals
 from jvr.model.volume import Volume
 from jvr.types import Scalar
 
-# Stands for a kept sample that is made of missing voxels.
+# Stands for a cached sample that is made of missing voxels.
 MISSING = 65535
 
 
@@ -33,8 +33,8 @@ class VoxelField(AbstractField):
         return VoxelField(*self.normals.deposit(self.volume, (gradient.volume, gradient.normals), points.p, cotangent[:3]))
 
 
-class KeptField(AbstractField):
-    """Scalars kept from an earlier march along the same rays: sample `k` of a ray is `stored[start[ray] + k * stride]`, an integer
+class CachedSamples(AbstractField):
+    """Scalars cached by an earlier march along the same rays: sample `k` of a ray is `stored[start[ray] + k * stride]`, an integer
     that stands for `low + scale * stored`, or with `gaps` for a missing one where it is `MISSING`. Positions play no part, and nothing here
     is differentiable."""
 
@@ -47,7 +47,7 @@ class KeptField(AbstractField):
 
     def resample(self, point: Point) -> Sample:
         # Clipped: the index of a finished ray may lie beyond the end.
-        index = self.start[point.ray] + point.segment * self.stride
+        index = self.start[point.ray] + point.k * self.stride
         stored = self.stored.at[index].get(mode="clip")
         known = ((stored != MISSING).astype(self.low.dtype),) if self.gaps else ()
         return Sample(self.low + self.scale * stored.astype(self.low.dtype), known=known)

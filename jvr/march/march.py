@@ -1,4 +1,4 @@
-"""THE loop: a batch of rays, front to back, one segment of every ray at a time."""
+"""THE loop of ray marching: a batch of rays, front to back, one segment of every ray at a time."""
 
 import dataclasses
 import functools
@@ -8,11 +8,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from jvr.march.batch import pooled_while
 from jvr.march.medium import Medium
-from jvr.march.segments import Lanes, channel_counts, first_visible, lanes_of, leap, shown, take_segment
+from jvr.march.segments import ActiveRays, active_rays, channel_counts, first_visible, occupied_count, skip, take_segment
 from jvr.march.steps import Rays
 from jvr.march.sums import Sums, add_segment, join, opaque_depth
+from jvr.march.wavefront import wavefront_while
 from jvr.types import Channels, Scalar
 
 
@@ -25,7 +25,7 @@ class MarchOptions:
 
 
 class Marched(NamedTuple):
-    """What the loop returns for each ray.
+    """What a march returns for each ray.
 
     `radiance`: three components, or none where nothing is emitted; `tau`: optical depth, one or three components, or none;
     `distance`: opacity-weighted distance from the entry, not yet divided by the opacity, a component for each of `tau`, or none;
@@ -39,7 +39,7 @@ class Marched(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """How far a ray has come: its sums, the segment that comes next, how many it sampled and, for each channel of optical depth, the
+    """The state of a ray in a march: its sums, the segment that comes next, how many it sampled and, for each channel of optical depth, the
     last segment that light from behind could still reach the eye through (`last`), with the optical depth in front of it (`front`)."""
 
     sums: Sums
@@ -49,8 +49,8 @@ class Progress(NamedTuple):
     last: tuple[Int[Array, "rays"], ...]
 
 
-class Noted(NamedTuple):
-    """What a replay needs of a ray's `Progress` at its end."""
+class ReplayRecord(NamedTuple):
+    """The record that a replay starts from: what it needs of a ray's `Progress` at its end."""
 
     following: Int[Array, "rays"]
     front: Channels
@@ -68,49 +68,51 @@ def march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marc
 
 def integrate(
     options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar, *, for_replay: bool = False
-) -> tuple[Marched, Noted | None]:
+) -> tuple[Marched, ReplayRecord | None]:
     """What every ray gathered, and where a replay will need it, what that starts from."""
     emits, absorbs = channel_counts(medium, rays, dt)
 
-    def start(inputs: tuple[Lanes, Int[Array, "rays"]]) -> Progress:
-        lanes, following = inputs
-        zero = jnp.zeros_like(lanes.rays.length)
+    def start(inputs: tuple[ActiveRays, Int[Array, "rays"]]) -> Progress:
+        active, following = inputs
+        zero = jnp.zeros_like(active.rays.length)
         blank = (zero,) * absorbs
         sums = Sums((zero,) * emits, (zero,) * emits, blank, blank, blank * options.distance)
-        none = jnp.zeros_like(lanes.segments)
+        none = jnp.zeros_like(active.segments)
         return Progress(sums, following, none, blank * for_replay, (none,) * absorbs * for_replay)
 
-    def alive(inputs: tuple[Lanes, Int[Array, "rays"]], progress: Progress) -> Bool[Array, "rays"]:
+    def alive(inputs: tuple[ActiveRays, Int[Array, "rays"]], progress: Progress) -> Bool[Array, "rays"]:
         return is_alive(options, inputs[0], progress)
 
-    def advance(inputs: tuple[Lanes, Int[Array, "rays"]], progress: Progress, _: None) -> tuple[Progress, None]:
-        lanes = inputs[0]
-        k = jnp.where(is_alive(options, lanes, progress), leap(medium, lanes, dt, progress.following), progress.following)
-        leapt, progress = k > progress.following, progress._replace(following=k)
-        alive = is_alive(options, lanes, progress)
-        emitted, dtau, u = take_segment(medium, lanes, dt, k, shown(medium, lanes, dt, k, jnp.where(alive, lanes.segments, 0)))
-        # Where a ray ends with a leap, the last segment that it leapt over is the one to be noted.
-        front, last = note_front(progress, alive | leapt, k - ~alive) if for_replay else ((), ())
+    def advance(inputs: tuple[ActiveRays, Int[Array, "rays"]], progress: Progress, _: None) -> tuple[Progress, None]:
+        active = inputs[0]
+        k = jnp.where(is_alive(options, active, progress), skip(medium, active, dt, progress.following), progress.following)
+        skipped, progress = k > progress.following, progress._replace(following=k)
+        alive = is_alive(options, active, progress)
+        emitted, dtau, u = take_segment(
+            medium, active, dt, k, occupied_count(medium, active, dt, k, jnp.where(alive, active.segments, 0))
+        )
+        # Where a ray ends with a skip, the last segment that it skipped is the one to be recorded.
+        front, last = record_front(progress, alive | skipped, k - ~alive) if for_replay else ((), ())
         sums = add_segment(progress.sums, emitted, dtau, u)
         return Progress(sums, k + alive, progress.steps + alive, front, last), None
 
-    def finish(progress: Progress) -> tuple[Marched, Noted | None]:
-        noted = Noted(progress.following, progress.front, progress.last) if for_replay else None
-        return marched(progress), noted
+    def finish(progress: Progress) -> tuple[Marched, ReplayRecord | None]:
+        record = ReplayRecord(progress.following, progress.front, progress.last) if for_replay else None
+        return marched(progress), record
 
-    lanes = lanes_of(rays, dt)
-    first = first_visible(medium, lanes, dt)
-    work = lanes.segments - first
-    gathered, noted = pooled_while(alive, advance, start, finish, (lanes, first), None, work)[0]
-    if noted is not None:
+    active = active_rays(rays, dt)
+    first = first_visible(medium, active, dt)
+    work = active.segments - first
+    gathered, record = wavefront_while(alive, advance, start, finish, (active, first), None, work)[0]
+    if record is not None:
         # Rays without work were not started; a replay that skips nothing still has all of their segments to look at.
         blank = work == 0
-        last = tuple(jnp.where(blank, lanes.segments - 1, x) for x in noted.last)
-        noted = noted._replace(following=jnp.where(blank, lanes.segments, noted.following), last=last)
-    return gathered, noted
+        last = tuple(jnp.where(blank, active.segments - 1, x) for x in record.last)
+        record = record._replace(following=jnp.where(blank, active.segments, record.following), last=last)
+    return gathered, record
 
 
-def note_front(progress: Progress, moved: Bool[Array, "rays"], k: Int[Array, "rays"]):
+def record_front(progress: Progress, moved: Bool[Array, "rays"], k: Int[Array, "rays"]):
     """`front` and `last` as the rays that have `moved` are in front of segment `k`."""
     depth = join(progress.sums.tau, progress.sums.tau_low)
     clear = [moved & (now < opaque_depth(now.dtype)) for now in depth]
@@ -125,9 +127,9 @@ def marched(progress: Progress) -> Marched:
     return Marched(join(sums.radiance, sums.radiance_low), join(sums.tau, sums.tau_low), sums.distance, progress.steps)
 
 
-def is_alive(options: MarchOptions, lanes: Lanes, progress: Progress) -> Bool[Array, "rays"]:
+def is_alive(options: MarchOptions, active: ActiveRays, progress: Progress) -> Bool[Array, "rays"]:
     """Whether the next segment of each ray is to be taken: it lies inside, and something of it can still reach the eye."""
-    alive = progress.following < lanes.segments
+    alive = progress.following < active.segments
     if progress.sums.tau:
         thinnest = functools.reduce(jnp.minimum, progress.sums.tau)
         # Even without a bound: behind so much nothing can be seen.

@@ -1,4 +1,4 @@
-"""What rays march through: the contracts between the loop and what fills it.
+"""Fields, shaders and visibility: the contracts between the ray marching loop and the medium that it goes through.
 
 The loop knows no effect by name. It is handed a `Medium`: a field that is resampled at a point, a shader that turns what was resampled
 into emitted radiance and optical depth, and where the scene asks for it, how much light arrives.
@@ -16,13 +16,13 @@ from jvr.march.steps import Point, Sample
 from jvr.model.transfer import AbstractTable, Classified
 from jvr.types import Channels, Scalar
 
-# Optical depth of a segment, and of a voxel on the way of light, beyond which denser media are lit alike: light gets about as deep into
+# Optical depth of a segment, and of a voxel on a path of light, beyond which denser media are lit alike: light gets about as deep into
 # them as the eye sees. Without it the two would be compared at distances that a position in single precision cannot tell apart.
 DENSEST = 64.0
 
 
 class AbstractField(eqx.Module):
-    """What is resampled along rays; its arrays may be large."""
+    """A field that is resampled along rays; its arrays may be large."""
 
     @abc.abstractmethod
     def resample(self, point: Point) -> Sample:
@@ -35,7 +35,7 @@ class AbstractField(eqx.Module):
 
 
 class AbstractVisibility(eqx.Module):
-    """How much of each light reaches a point, and of that from all around where the scene asks for it."""
+    """Visibility: how much of each light reaches a point, and of the environment's where the scene asks for it."""
 
     @abc.abstractmethod
     def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
@@ -52,27 +52,27 @@ class AbstractVisibility(eqx.Module):
 
 
 class AbstractShader(eqx.Module):
-    """What a segment looks like: everything between the scalar and the eye. Its arrays are small."""
+    """A shader, what a segment emits and absorbs: everything between the scalar and the eye. Its arrays are small."""
 
     # Where in a segment the field is resampled, from -1/2 at its front to 1/2 at its back.
-    places: ClassVar[tuple[float, ...]] = (0.0,)
+    quadrature_nodes: ClassVar[tuple[float, ...]] = (0.0,)
 
     @abc.abstractmethod
-    def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+    def shade(self, classified: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         """Emitted radiance (three components or none) and optical depth (one, three or none) of one segment of length `dt` whose
         properties are constant."""
 
-    def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        """The same for a segment around `point`, from what is known at `places`."""
-        sample = self.prepare(transfer, samples[0], point)
-        return self.segment(self.classify(transfer, sample), sample, point, dt)
+    def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        """The same for a segment around `point`, from what is known at `quadrature_nodes`."""
+        sample = self.in_world(transfer, samples[0], point)
+        return self.shade(self.classify(transfer, sample), sample, point, dt)
 
-    def prepare(self, transfer: Any, sample: Sample, point: Point) -> Sample:
+    def in_world(self, transfer: Any, sample: Sample, point: Point) -> Sample:
         """The sample with its gradient in the world."""
         return sample
 
     def classify(self, transfer: Any, sample: Sample) -> Classified:
-        """Colour and extinction of a prepared sample."""
+        """Colour and extinction of a sample `in_world`."""
         return transfer.evaluate(sample.s)
 
 
@@ -81,7 +81,7 @@ class Medium(NamedTuple):
     is not `None`, each sample knows how much light reaches it."""
 
     field: AbstractField
-    transfer: Any  # what `shader.look` reads: an AbstractTransfer, or one prepared for the shader
+    transfer: Any  # what `shader.evaluate_segment` reads: an AbstractTransfer, or one made for the shader
     shader: AbstractShader
     occupancy: Occupancy | None = None
     shadows: AbstractVisibility | None = None
@@ -106,7 +106,7 @@ def for_derivatives(medium: Medium, wanted: Medium, moved: Any = None) -> Medium
 
 
 def taking_all(medium: Medium) -> Medium:
-    """A medium in which nothing that may have a derivative is leapt over, on the way of light neither."""
+    """A medium in which nothing that may have a derivative is skipped, along the paths of light neither."""
     is_occupancy = lambda x: isinstance(x, Occupancy)
     dropped = lambda x: None if is_occupancy(x) and not x.is_bounded else x
     return jax.tree.map(dropped, medium, is_leaf=is_occupancy)

@@ -40,12 +40,12 @@ class DistanceField(eqx.Module):
 
 
 class AbstractOracle(eqx.Module):
-    """Where samples may be far apart. `brick`: voxels along an edge of the bricks that are looked at."""
+    """An oracle: where samples may be far apart. `brick`: voxels along an edge of the bricks that are looked at."""
 
     brick: ClassVar[int]
 
     @abc.abstractmethod
-    def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:
+    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
         """The distance between samples that each brick asks for by itself, a world length, infinite where any will do."""
 
 
@@ -54,7 +54,7 @@ class Finest(AbstractOracle):
 
     brick: ClassVar[int] = 64
 
-    def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:
+    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
         return jnp.zeros_like(bricks_of(volume.values, self.brick).lower, jnp.result_type(volume.slope))
 
 
@@ -77,8 +77,8 @@ class OpacityChange(_Tolerant):
 
     brick: ClassVar[int] = 1
 
-    def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:
-        change = _spread(look._replace(features=look.features[-1:]), *_bounds(volume, self.brick))
+    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
+        change = _spread(features._replace(rows=features.rows[-1:]), *_bounds(volume, self.brick))
         return jnp.where(change <= self.tolerance, jnp.inf, 0.0)
 
 
@@ -88,8 +88,8 @@ class BrickRange(_Tolerant):
 
     brick: ClassVar[int] = 4
 
-    def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:
-        change = _spread(look, *_bounds(volume, self.brick))
+    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
+        change = _spread(features, *_bounds(volume, self.brick))
         return jnp.min(volume.spacing) * self.brick * _quotient(self.tolerance, change)
 
 
@@ -108,23 +108,23 @@ class LocalError(_Tolerant):
 
     brick: ClassVar[int] = 1
 
-    def wanted(self, volume: Volume, look: "Look") -> Float[Array, "bx by bz"]:
+    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
         c1, c2, largest = (bricks_of(c, self.brick).upper for c in _curvatures(volume))
         low, high = _bounds(volume, self.brick)
         # Interpolated values leave the range of the voxels by no more than a second difference.
-        slope = _steepest(look, low - largest, high + largest)
+        slope = _steepest(features, low - largest, high + largest)
         ask = lambda c, scale: _quotient(scale * self.tolerance, slope * c)
         distance = jnp.minimum(ask(c1, 4.0), jnp.sqrt(ask(c2, 8.0)))
         return jnp.where(jnp.isnan(low + high), 0.0, distance)
 
 
 def distance_field(
-    oracle: AbstractOracle, volume: Volume, table: LinearTransfer | LutTransfer, optical: AbstractOpticalModel, reach: Scalar
+    oracle: AbstractOracle, volume: Volume, table: LinearTransfer | LutTransfer, optical: AbstractOpticalModel, farthest: Scalar
 ) -> DistanceField:
-    """What `oracle` says, up to the world length `reach`; traceable, not differentiable."""
-    volume, table, optical, reach = jax.lax.stop_gradient((volume, table, optical, reach))
-    wanted = oracle.wanted(volume, look_at(volume, table, optical))
-    return DistanceField(envelope(wanted, thickness(volume, oracle.brick), reach), oracle.brick)
+    """What `oracle` says, up to the world length `farthest`; traceable, not differentiable."""
+    volume, table, optical, farthest = jax.lax.stop_gradient((volume, table, optical, farthest))
+    wanted = oracle.wanted(volume, features_of(volume, table, optical))
+    return DistanceField(envelope(wanted, thickness(volume, oracle.brick), farthest), oracle.brick)
 
 
 def thickness(volume: Volume, brick: int) -> Triple:
@@ -134,14 +134,14 @@ def thickness(volume: Volume, brick: int) -> Triple:
     return tuple(brick / jnp.linalg.norm(row) for row in rows)
 
 
-def envelope(wanted: Float[Array, "bx by bz"], thickness: Triple, reach: Scalar) -> Float[Array, "bx by bz"]:
-    """`min over bricks b of wanted[b] + (distance to b)`, for every brick; at most `reach` and what is wanted there.
+def envelope(wanted: Float[Array, "bx by bz"], thickness: Triple, farthest: Scalar) -> Float[Array, "bx by bz"]:
+    """`min over bricks b of wanted[b] + (distance to b)`, for every brick; at most `farthest` and what is wanted there.
 
     Distances are between slabs, `max over axes of (|difference of indices| - 1) * thickness`: never more than the Euclidean distance
     between any two points of the bricks. With 0 and infinity in `wanted` this is a distance transform (chessboard metric).
     """
     finest = jnp.minimum(jnp.minimum(thickness[0], thickness[1]), thickness[2])
-    # Bricks on each side that a radius reaches; a rounding above a whole number is not one more.
+    # Bricks on each side that a radius reaches; a rounding above an integer is not one more.
     width = lambda radius: [jnp.ceil(radius / t - 1e-3) for t in thickness]
 
     def grow(state: tuple[Int[Array, ""], Array, Array]):
@@ -150,8 +150,8 @@ def envelope(wanted: Float[Array, "bx by bz"], thickness: Triple, reach: Scalar)
             smallest = jnp.where(now > before, _smallest_of_three(smallest, axis), smallest)
         return k + 1, smallest, jnp.minimum(distance, smallest + k * finest)
 
-    start = (jnp.int32(0), wanted, jnp.minimum(wanted, reach))
-    return jax.lax.while_loop(lambda state: state[0] * finest < reach, grow, start)[2]
+    start = (jnp.int32(0), wanted, jnp.minimum(wanted, farthest))
+    return jax.lax.while_loop(lambda state: state[0] * finest < farthest, grow, start)[2]
 
 
 def _smallest_of_three(values: Float[Array, "x y z"], axis: int) -> Float[Array, "x y z"]:
@@ -161,20 +161,20 @@ def _smallest_of_three(values: Float[Array, "x y z"], axis: int) -> Float[Array,
     return jnp.minimum(values, jnp.minimum(before, after))
 
 
-class Look(NamedTuple):
+class Features(NamedTuple):
     """What one voxel length of the medium adds to a picture, a row for each feature (emission in each channel, then opacity), at the
     entries of a table."""
 
     table: LinearTransfer | LutTransfer
     positions: Float[Array, "n"]
-    features: Float[Array, "features n"]
+    rows: Float[Array, "features n"]
 
 
-def look_at(volume: Volume, table: LinearTransfer | LutTransfer, optical: AbstractOpticalModel) -> Look:
-    """What the medium looks like to an oracle."""
+def features_of(volume: Volume, table: LinearTransfer | LutTransfer, optical: AbstractOpticalModel) -> Features:
+    """The features of the medium that an oracle looks at."""
     classified = jax.vmap(table.evaluate)(table.positions)
-    emitted, dtau = optical.segment(classified, jnp.min(volume.spacing))
-    return Look(table, table.positions, jnp.stack([*emitted, *map(one_minus_exp, dtau)]))
+    emitted, dtau = optical.evaluate_segment(classified, jnp.min(volume.spacing))
+    return Features(table, table.positions, jnp.stack([*emitted, *map(one_minus_exp, dtau)]))
 
 
 def _bounds(volume: Volume, brick: int) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
@@ -184,13 +184,13 @@ def _bounds(volume: Volume, brick: int) -> tuple[Float[Array, "bx by bz"], Float
     return jnp.minimum(*ends), jnp.maximum(*ends)
 
 
-def _spread(look: Look, low: Float[Array, "bx by bz"], high: Float[Array, "bx by bz"]) -> Float[Array, "bx by bz"]:
+def _spread(features: Features, low: Float[Array, "bx by bz"], high: Float[Array, "bx by bz"]) -> Float[Array, "bx by bz"]:
     """The largest range of any feature over the scalars `low` ... `high`; infinite where they are NaN."""
-    coordinate = jax.vmap(look.table.coordinate)
+    coordinate = jax.vmap(features.table.coordinate)
     u, v = coordinate(low.ravel()), coordinate(high.ravel())
     first, last = jnp.ceil(u).astype(jnp.int32), jnp.floor(v).astype(jnp.int32)
     spread = jnp.zeros_like(u)
-    for feature in look.features:
+    for feature in features.rows:
         a, b = _lerp(feature, u), _lerp(feature, v)
         inside, below = _largest(feature, first, last), -_largest(-feature, first, last)
         top = jnp.maximum(jnp.maximum(a, b), jnp.where(last >= first, inside, -jnp.inf))
@@ -199,12 +199,12 @@ def _spread(look: Look, low: Float[Array, "bx by bz"], high: Float[Array, "bx by
     return jnp.where(jnp.isnan(low + high), jnp.inf, spread.reshape(low.shape))
 
 
-def _steepest(look: Look, low: Float[Array, "bx by bz"], high: Float[Array, "bx by bz"]) -> Float[Array, "bx by bz"]:
+def _steepest(features: Features, low: Float[Array, "bx by bz"], high: Float[Array, "bx by bz"]) -> Float[Array, "bx by bz"]:
     """The steepest slope of any feature over the scalars `low` ... `high`."""
-    coordinate = jax.vmap(look.table.coordinate)
+    coordinate = jax.vmap(features.table.coordinate)
     first = jnp.floor(coordinate(low.ravel())).astype(jnp.int32)
     last = jnp.ceil(coordinate(high.ravel())).astype(jnp.int32) - 1
-    slopes = jnp.max(jnp.abs(jnp.diff(look.features, axis=1)), axis=0) / jnp.diff(look.positions)
+    slopes = jnp.max(jnp.abs(jnp.diff(features.rows, axis=1)), axis=0) / jnp.diff(features.positions)
     return jnp.where(last >= first, _largest(slopes, first, last), 0.0).reshape(low.shape)
 
 

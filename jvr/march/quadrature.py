@@ -15,8 +15,8 @@ class AbstractQuadrature(eqx.Module):
 
 
 class Midpoint(AbstractQuadrature):
-    """The scalar at the middle of a segment stands for all of it: order 2 in the step where the transfer function is smooth, one
-    resampling a segment. Peaks of the transfer function that the scalar passes between two samples are missed. The default."""
+    """The midpoint rule, the scalar at the middle of a segment for all of it: order 2 in the step where the transfer function is smooth,
+    one resampling a segment. Peaks of the transfer function that the scalar passes between two samples are missed. The default."""
 
     @property
     def explanation(self) -> str:
@@ -24,11 +24,11 @@ class Midpoint(AbstractQuadrature):
 
 
 class PreIntegrated(AbstractQuadrature):
-    """The scalar goes linearly from the front of a segment to its back, and extinction and emission are integrated over all values
-    between (`jvr.model.preintegration`): thin peaks are seen, at two resamplings a segment.
+    """Pre-integration: the scalar goes linearly from the front of a segment to its back, and extinction and emission are integrated over
+    all values between (`jvr.model.preintegration`): thin peaks are seen, at two resamplings a segment.
 
     **Arguments:** `parts`: how many parts of a segment its self-attenuation takes apart, order 4. Needs a `LinearTransfer` or a
-    `LutTransfer`. **Raises** `ValueError` where `parts` is not a positive whole number.
+    `LutTransfer`. **Raises** `ValueError` where `parts` is not a positive integer.
     """
 
     parts: int = eqx.field(static=True, default=1)

@@ -1,4 +1,4 @@
-"""Shaders that know nothing but the optical model: an unlit medium."""
+"""Shaders of an unlit medium, by the optical model alone."""
 
 from typing import Any, ClassVar
 
@@ -58,10 +58,10 @@ class OpticalShader(AbstractShader):
     optical: AbstractOpticalModel
     frame: GradientFrame | None
 
-    def segment(self, medium: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
-        return self.optical.segment(medium, dt)
+    def shade(self, classified: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+        return self.optical.evaluate_segment(classified, dt)
 
-    def prepare(self, transfer: Any, sample: Sample, point: Point) -> Sample:
+    def in_world(self, transfer: Any, sample: Sample, point: Point) -> Sample:
         return sample if self.frame is None else self.frame.in_world(transfer, sample, point)
 
     def classify(self, transfer: Any, sample: Sample) -> Classified:
@@ -85,9 +85,9 @@ class LightPathShader(OpticalShader):
 class PreIntegratedShader(OpticalShader):
     """The optical model alone, the scalar linear along a segment."""
 
-    places: ClassVar[tuple[float, ...]] = (-0.5, 0.5)
+    quadrature_nodes: ClassVar[tuple[float, ...]] = (-0.5, 0.5)
 
-    def look(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
+    def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
-        emitted, dtau = transfer.segment(self.optical, front.s, back.s, dt)
+        emitted, dtau = transfer.evaluate_segment(self.optical, front.s, back.s, dt)
         return where_known(samples, emitted), where_known(samples, dtau)

@@ -35,10 +35,10 @@ NEVER = 2**30
 
 @dataclasses.dataclass(frozen=True)
 class SliceOptions:
-    """Static choices.
+    """Static choices of adaptive sampling on slices.
 
     `levels`: of the pyramid above the finest, whose size `width` x `height` is divisible by `2^levels`; `termination`: a pixel ends
-    with the first block behind which its transmittance, in every channel, is at most this; `segment(shading, (front, back,
+    with the first block behind which its transmittance, in every channel, is at most this; `evaluate_segment(shading, (front, back,
     length))`: radiance and optical depth of some segments from the scalars at their ends.
     """
 
@@ -46,7 +46,7 @@ class SliceOptions:
     width: int
     height: int
     termination: float
-    segment: Callable[[Any, tuple[Array, Array, Array]], tuple[Channels, Channels]]
+    evaluate_segment: Callable[[Any, tuple[Array, Array, Array]], tuple[Channels, Channels]]
 
     @property
     def period(self) -> int:
@@ -77,7 +77,7 @@ class Lattice(NamedTuple):
 
 
 class Slices(NamedTuple):
-    """What is marched through: `shading` is what `SliceOptions.segment` needs to know. Detached: `distances`."""
+    """What is marched through: `shading` is what `SliceOptions.evaluate_segment` needs to know. Detached: `distances`."""
 
     volume: Volume
     shading: Any
@@ -156,7 +156,7 @@ def take_block(
         pyramid, visited, samples = take_slice(options, slices, ended, base + r, pyramid, taps)
         mask, s = visited & begun, pyramid[0].s
         u0, u1 = (distance(lattice.rays[0], k, slices.dt) for k in (k_before, (base + r).astype(blank.dtype)))
-        added: Any = map_selected(options.segment, mask, slices.shading, (before, s, u1 - u0))
+        added: Any = map_selected(options.evaluate_segment, mask, slices.shading, (before, s, u1 - u0))
         emitted, dtau = added
         weights = opacity((jnp.ones_like(blank),) * absorbs, dtau)
         emitted = (*emitted, *(a * (u0 + u1) / 2 for a in weights))
@@ -273,7 +273,7 @@ def _parents(fine: Bool[Array, "h w"]) -> Bool[Array, "h2 w2"]:
     return padded
 
 
-def position(rows: Float[Array, "lanes 8"], k: Int[Array, ""], dt: Scalar, shape: tuple[int, int, int]) -> Triple:
+def position(rows: Float[Array, "block 8"], k: Int[Array, ""], dt: Scalar, shape: tuple[int, int, int]) -> Triple:
     """Grid positions of samples on slice `k`, clamped to where each ray is inside."""
     u = distance(rows, k, dt)
     p = [rows[:, i] + u * rows[:, 3 + i] for i in range(3)]
@@ -283,7 +283,7 @@ def position(rows: Float[Array, "lanes 8"], k: Int[Array, ""], dt: Scalar, shape
     return tuple(rounded_into(x, low, high) for x, (low, high) in zip(p, bounds, strict=True))
 
 
-def distance(rows: Float[Array, "lanes 8"], k: Array, dt: Scalar) -> Float[Array, "lanes"]:
+def distance(rows: Float[Array, "block 8"], k: Array, dt: Scalar) -> Float[Array, "block"]:
     """`u` on slice `k`."""
     return smaller(larger(rows[:, 6] + k * dt, 0.0), rows[:, 7])
 
@@ -305,7 +305,7 @@ def blank_sums(options: SliceOptions, slices: Slices) -> Sums:
 def channel_counts(options: SliceOptions, slices: Slices) -> tuple[int, int]:
     """How many channels the medium emits and absorbs in, by shape alone."""
     one = jax.ShapeDtypeStruct((1,), slices.dt.dtype)
-    emitted, dtau = jax.eval_shape(options.segment, slices.shading, (one, one, one))
+    emitted, dtau = jax.eval_shape(options.evaluate_segment, slices.shading, (one, one, one))
     return len(emitted), len(dtau)
 
 

@@ -142,8 +142,8 @@ def _deposit_level(slices: Slices, level: int, k: Int[Array, ""], cotangent: Flo
     """Adds the derivative of the samples of one level of a slice. Where the cotangent is zero, as where none was taken, nothing is done."""
     volume, rays = slices.volume, slices.lattice.rays[level]
 
-    def body(index: Int[Array, "lanes"], valid: Bool[Array, "lanes"], lanes: tuple[Array, Array], gradient: Any) -> Any:
-        rows, cotangent = lanes[0], jnp.where(valid, lanes[1], 0.0)
+    def body(index: Int[Array, "block"], valid: Bool[Array, "block"], read: tuple[Array, Array], gradient: Any) -> Any:
+        rows, cotangent = read[0], jnp.where(valid, read[1], 0.0)
         point = Point(position(rows, k, slices.dt, volume.shape), (), index, jnp.broadcast_to(k, index.shape))
         field: Any = VoxelField(volume).deposit(VoxelField(gradient.volume), point, Sample(cotangent))
         gradient = gradient._replace(volume=field.volume)

@@ -1,4 +1,4 @@
-"""Where samples lie along a ray.
+"""Sample positions along a ray.
 
 Segments of length `dt` tile the part of a ray that lies inside the medium, from its entry to its exit; the last one is
 shortened. Each is sampled at its own midpoint. Positions come from the segment's index, never by accumulation, and are measured
@@ -29,16 +29,16 @@ class Rays(NamedTuple):
 
 class Point(NamedTuple):
     """One sample on one ray: its grid position, the ray's direction (grid coordinates per world length), the ray's index in the batch
-    and the index of its segment."""
+    and `k`, the index of its segment."""
 
     p: Triple
     direction: Triple
     ray: Int[Array, ""]
-    segment: Int[Array, ""]
+    k: Int[Array, ""]
 
 
 class Sample(NamedTuple):
-    """What is known at a point; parts that nobody asks for are empty.
+    """What is resampled at a point; fields that nobody asks for are empty.
 
     `s`: the scalar; `gradient`: its derivatives along the grid axes, or those of the extinction; `neighbours`: what else a gradient is made
     of, such as scalars around the point before the transfer function; `light`: for each light, the transmittance between it and the point;
@@ -57,7 +57,7 @@ def segment_count(length: Float[Array, "rays"], dt: Scalar) -> Int[Array, "rays"
     return jnp.ceil(jax.lax.stop_gradient(length / dt)).astype(jnp.int32)
 
 
-def segment(k: Int[Array, "..."], count: Int[Array, "rays"], length: Float[Array, "rays"], dt: Scalar):
+def segment_span(k: Int[Array, "..."], count: Int[Array, "rays"], length: Float[Array, "rays"], dt: Scalar):
     """Length of segment `k` of each ray, and the distance of its midpoint from the entry.
 
     Only the last segment's length depends on where the ray leaves. Past it the length is zero and the point stays at the exit,

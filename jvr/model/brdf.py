@@ -1,11 +1,11 @@
-"""Reflectance as material functions: which share of the light from one direction a surface sends into another.
+"""Reflectance as material functions: which fraction of the light from one direction a surface sends into another.
 
 The material function is `M(w_o, w_i) = f(w_o, w_i) max(n . w_i, 0)`, the BRDF times the cosine, per solid angle of `w_i`: its
-integral over the sphere is the share reflected to `w_o` of light that is the same from everywhere. All are isotropic and in the
+integral over the sphere is the fraction reflected to `w_o` of light that is the same from everywhere. All are isotropic and in the
 surface's own frame: `n = (0, 0, 1)`, and `w_o`, `w_i` are unit directions that point away from the point, to the eye and to the light.
 
-A material function has two parts: `tinted` is multiplied with the colour of the transfer function, `plain` keeps the colour of the
-light, as highlights of everything but metals do.
+A material function has two parts: `tinted` is multiplied with the colour of the transfer function, `plain` is unmodulated: it
+keeps the colour of the light, as highlights of everything but metals do.
 """
 
 import abc
@@ -17,61 +17,61 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import float_array, require
-from jvr.model.material import About, AbstractBRDF
+from jvr.model.material import AbstractBRDF, SymmetryAxis
 from jvr.model.phase import AbstractPhase, ScatteringAngle, components
-from jvr.model.ranges import NOT_NEGATIVE, SHARE, within
+from jvr.model.ranges import NOT_NEGATIVE, UNIT_INTERVAL, within
 from jvr.numerics import direction_and_length, power_of_cosine
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 
 class LambertBRDF(AbstractBRDF):
-    """Matte: `M = reflectance / pi max(n . w_i, 0)`, tinted.
+    """Diffuse (Lambert): `M = reflectance / pi max(n . w_i, 0)`, tinted.
 
-    **Arguments:** `reflectance`: share reflected, in [0, 1], a number or `(3,)`; differentiable. **Raises** `ValueError` otherwise.
+    **Arguments:** `reflectance`: fraction reflected, in [0, 1], a number or `(3,)`; differentiable. **Raises** `ValueError` otherwise.
     """
 
-    about: ClassVar[About] = "normal"
-    reflectance: Float[Array, "..."] = eqx.field(metadata=within(SHARE))
+    symmetry_axis: ClassVar[SymmetryAxis] = "normal"
+    reflectance: Float[Array, "..."] = eqx.field(metadata=within(UNIT_INTERVAL))
 
     def __init__(self, reflectance: ArrayLike = 1.0):
-        self.reflectance = share(reflectance, "reflectance", (), (3,))
+        self.reflectance = fraction(reflectance, "reflectance", (), (3,))
 
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
-        return matte(self.reflectance, w_i), ()
+        return lambert(self.reflectance, w_i), ()
 
 
 class AbstractGlossyBRDF(AbstractBRDF):
-    """A matte part, tinted, and a glossy lobe in the light's own colour: `diffuse / pi max(n . w_i, 0)` and
+    """A diffuse part, tinted, and a specular lobe in the light's own colour: `diffuse / pi max(n . w_i, 0)` and
     `specular lobe(w_o, w_i) max(n . w_i, 0)`, zero where either direction is below the surface.
 
     **Arguments:** `diffuse`, `specular`: in [0, 1], each a number or `(3,)`; where their sum is at most 1 no more is reflected than
     arrives. `exponent`: `e`, a number, not negative. All differentiable. **Raises** `ValueError` otherwise.
     """
 
-    about: ClassVar[About] = "both"
-    diffuse: Float[Array, "..."] = eqx.field(metadata=within(SHARE))
-    specular: Float[Array, "..."] = eqx.field(metadata=within(SHARE))
+    symmetry_axis: ClassVar[SymmetryAxis] = "both"
+    diffuse: Float[Array, "..."] = eqx.field(metadata=within(UNIT_INTERVAL))
+    specular: Float[Array, "..."] = eqx.field(metadata=within(UNIT_INTERVAL))
     exponent: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, diffuse: ArrayLike, specular: ArrayLike, exponent: ArrayLike):
-        self.diffuse, self.specular = share(diffuse, "diffuse", (), (3,)), share(specular, "specular", (), (3,))
+        self.diffuse, self.specular = fraction(diffuse, "diffuse", (), (3,)), fraction(specular, "specular", (), (3,))
         self.exponent = float_array(exponent, "exponent", ())
         require(self.exponent, NOT_NEGATIVE.holds, "exponent must be finite and not negative; 30 is a soft highlight")
 
     @abc.abstractmethod
     def lobe(self, w_o: Triple, w_i: Triple) -> Float[Array, "..."]:
-        """The glossy lobe, per solid angle, where both directions are above the surface."""
+        """The specular lobe, per solid angle, where both directions are above the surface."""
 
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
         received = jnp.where(above(w_o, w_i), self.lobe(w_o, w_i) * w_i[2], 0.0)
-        return matte(self.diffuse, w_i), tuple(s * received for (s,) in components(self.specular))
+        return lambert(self.diffuse, w_i), tuple(s * received for (s,) in components(self.specular))
 
 
 class PhongBRDF(AbstractGlossyBRDF):
-    """Matte and a glossy lobe about the mirrored light, `(e + 2) / (2 pi) max(r . w_o, 0)^e` (Lafortune and Willems 1994, Using the
+    """Diffuse and a specular lobe about the mirrored light, `(e + 2) / (2 pi) max(r . w_o, 0)^e` (Lafortune and Willems 1994, Using the
     modified Phong reflectance model for physically based rendering).
 
-    Reciprocal. The lobe reflects the share `specular` to an eye that looks straight down, less to others: what of the lobe lies below
+    Reciprocal. The lobe reflects the fraction `specular` to an eye that looks straight down, less to others: what of the lobe lies below
     the surface is lost. Arguments as `AbstractGlossyBRDF`.
     """
 
@@ -85,10 +85,10 @@ class PhongBRDF(AbstractGlossyBRDF):
 
 
 class BlinnPhongBRDF(AbstractGlossyBRDF):
-    """Matte and a glossy lobe `(e + 2) (e + 4) / (8 pi (2^(-e/2) + e)) max(n . h, 0)^e`, `h` half-way between the directions to eye and
+    """Diffuse and a specular lobe `(e + 2) (e + 4) / (8 pi (2^(-e/2) + e)) max(n . h, 0)^e`, `h` half-way between the directions to eye and
     light.
 
-    The factor makes the share reflected straight up exactly `specular` (Giesen 2009, Phong and Blinn-Phong normalization factors); the
+    The factor makes the fraction reflected straight up exactly `specular` (Giesen 2009, Phong and Blinn-Phong normalization factors); the
     common `(e + 8) / (8 pi)` reflects up to 8 % more than arrives. Exponent 0 is Lambert's. Arguments as `AbstractGlossyBRDF`.
     """
 
@@ -103,18 +103,19 @@ class BlinnPhongBRDF(AbstractGlossyBRDF):
 
 
 class PhaseBRDF(AbstractBRDF):
-    """A medium without surface: tinted `albedo p(cos theta)`, `cos theta = -w_o . w_i`, and no cosine of `w_i`.
+    """A phase function as a material, a medium without surface: tinted `albedo p(cos theta)`, `cos theta = -w_o . w_i`, and no cosine of
+    `w_i`.
 
     **Arguments:** `phase`: any phase function, such as `jvr.HenyeyGreenstein(0.6)`; `albedo`: in [0, 1], a number or `(3,)`.
     All differentiable. **Raises** `ValueError` otherwise.
     """
 
-    about: ClassVar[About] = "eye"
+    symmetry_axis: ClassVar[SymmetryAxis] = "eye"
     phase: AbstractPhase
-    albedo: Float[Array, "..."] = eqx.field(metadata=within(SHARE))
+    albedo: Float[Array, "..."] = eqx.field(metadata=within(UNIT_INTERVAL))
 
     def __init__(self, phase: AbstractPhase, albedo: ArrayLike = 1.0):
-        self.phase, self.albedo = phase, share(albedo, "albedo", (), (3,))
+        self.phase, self.albedo = phase, fraction(albedo, "albedo", (), (3,))
 
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
         # Of one shape: a phase function's derivative rules do not broadcast.
@@ -125,7 +126,7 @@ class PhaseBRDF(AbstractBRDF):
         return tuple(albedo[c % len(albedo)] * values[c % len(values)] for c in range(n)), ()
 
 
-def matte(reflectance: Float[Array, "..."], w_i: Triple) -> Channels:
+def lambert(reflectance: Float[Array, "..."], w_i: Triple) -> Channels:
     """Lambert's `reflectance / pi max(n . w_i, 0)` for each component of the reflectance."""
     facing = jnp.maximum(w_i[2], 0.0) / math.pi
     return tuple(r * facing for (r,) in components(reflectance))
@@ -147,8 +148,8 @@ def where_or_normal(lit: Bool[Array, "..."], w: Triple) -> Triple:
     return jnp.where(lit, w[0], 0.0), jnp.where(lit, w[1], 0.0), jnp.where(lit, w[2], 1.0)
 
 
-def share(value: ArrayLike, name: str, *shapes: tuple[int, ...]) -> Float[Array, "..."]:
-    """A share between 0 and 1 as an array of one of the shapes."""
+def fraction(value: ArrayLike, name: str, *shapes: tuple[int, ...]) -> Float[Array, "..."]:
+    """A fraction between 0 and 1 as an array of one of the shapes."""
     array = float_array(value, name, *shapes)
-    require(array, SHARE.holds, f"{name} must be in [0, 1], a share of the light")
+    require(array, UNIT_INTERVAL.holds, f"{name} must be in [0, 1], a share of the light")
     return array

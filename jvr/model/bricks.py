@@ -1,4 +1,4 @@
-"""Smallest and largest voxel of each brick of a volume."""
+"""Min-max bricks: the smallest and the largest voxel of each brick of a volume."""
 
 import functools
 from typing import Any

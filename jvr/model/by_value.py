@@ -1,4 +1,4 @@
-"""Coefficients that depend on the scalar, as colours and extinction do."""
+"""Material coefficients by scalar: piecewise linear in it, as colours and extinction are."""
 
 from typing import TypeVar
 

@@ -51,7 +51,7 @@ def require(value: Any, condition: Any, message: str) -> None:
 def colours(value: ArrayLike | Any, name: str, *shapes: tuple[int | None, ...]) -> Float[Array, "..."]:
     """`float_array` of linear RGB of which 1 is white: finite, not negative, and not the codes of a file or a screen.
 
-    **Raises** `ValueError` for whole numbers above 1 and for anything above `LARGEST_COLOUR`, with the remedy.
+    **Raises** `ValueError` for integers above 1 and for anything above `LARGEST_COLOUR`, with the remedy.
     """
     array = float_array(value, name, *shapes)
     require(array, NOT_NEGATIVE.holds, f"{name} must be finite and not negative: it is linear RGB, and 1 is white")

@@ -1,4 +1,4 @@
-"""Light that enters a translucent material at one place and leaves it at another.
+"""Subsurface scattering by a dipole: light that enters a translucent material at one place and leaves it at another.
 
 Jensen, Marschner, Levoy and Hanrahan 2001, A practical model for subsurface light transport, section 2.2 and table 1: deep inside, light
 that was scattered many times spreads like heat, and a source below the surface with its negative mirror image above it tells how much
@@ -39,7 +39,8 @@ REFRACTION = Interval(1.0, 3.0)
 
 
 class Dipole(eqx.Module):
-    """Diffuse reflectance `R_d(r)` of a half space: the share of the light falling on a point that leaves at distance `r`, per area.
+    """Diffuse reflectance `R_d(r)` of a half space by a dipole: the fraction of the light falling on a point that leaves at distance `r`,
+    per area.
 
     `R_d = alpha' / (4 pi) sum_{z = z_r, z_v} z (1 + sigma_tr d) exp(-sigma_tr d) / d^3` with `d = sqrt(r^2 + z^2)`,
     `sigma_t' = sigma_s' + sigma_a`, `alpha' = sigma_s' / sigma_t'`, `sigma_tr = sqrt(3 sigma_a sigma_t')`, `z_r = 1 / sigma_t'`,
@@ -77,7 +78,7 @@ class Dipole(eqx.Module):
 
     @property
     def total(self) -> Triple:
-        """The share of all light that leaves again, the integral of `2 pi r R_d`:
+        """The fraction of all light that leaves again, the integral of `2 pi r R_d`:
         `alpha' / 2 (1 + exp(-4/3 A u)) exp(-u)` with `u = sqrt(3 (1 - alpha'))`.
 
         Its derivative in the absorption is infinite where there is none: without absorption, light returns from any distance. There it is

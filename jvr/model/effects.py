@@ -1,4 +1,4 @@
-"""What effects promise, so that a scene can hold them and no module of theirs is imported where it does not."""
+"""Interfaces of the effects, so that a scene can hold them and no module of theirs is imported where it does not."""
 
 import abc
 import dataclasses
@@ -11,32 +11,32 @@ from jvr.types import Channels, Scalar, Triple
 
 
 class AbstractShading(eqx.Module):
-    """How a surface reflects light."""
+    """Local shading: how a surface reflects light."""
 
     @abc.abstractmethod
-    def ambient_share(self) -> Scalar:
-        """Reflected share of ambient radiance."""
+    def ambient_reflectance(self) -> Scalar:
+        """Reflected fraction of ambient radiance."""
 
     @abc.abstractmethod
-    def surface_share(self, magnitude: Scalar) -> Scalar:
+    def surface_weight(self, magnitude: Scalar) -> Scalar:
         """How far a point whose gradient has this length is a surface, 0 ... 1; the rest reflects light as if it faced it."""
 
     @abc.abstractmethod
-    def reflect(self, share: Scalar, normal: Triple, w_o: Triple, w_i: Triple) -> tuple[Scalar, Scalar | None]:
+    def reflect(self, weight: Scalar, normal: Triple, w_o: Triple, w_i: Triple) -> tuple[Scalar, Scalar | None]:
         """Radiance towards `w_o` per irradiance from `w_i`: what the colour of the medium is multiplied with, and what is added to that
         in the colour of the light (`None` for nothing)."""
 
 
 class AbstractScattering(eqx.Module):
-    """How the medium scatters light."""
+    """Single scattering: how the medium scatters light."""
 
     @property
     @abc.abstractmethod
     def needs_gradient(self) -> bool:
-        """Whether `share` asks for the length of the gradient."""
+        """Whether `medium_weight` asks for the length of the gradient."""
 
     @abc.abstractmethod
-    def share(self, magnitude: Scalar) -> Scalar:
+    def medium_weight(self, magnitude: Scalar) -> Scalar:
         """How far a point whose gradient has this length is a medium and not a surface, 0 ... 1."""
 
     @abc.abstractmethod
@@ -49,10 +49,10 @@ class AbstractScattering(eqx.Module):
 
 
 class AbstractShadows(eqx.Module):
-    """A way to find the transmittance between lights and points."""
+    """A shadow algorithm: a way to find the transmittance between lights and points."""
 
     @abc.abstractmethod
-    def prepared(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
+    def visibility(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
         """A `jvr.march.medium.AbstractVisibility` of these lights, made once for a picture; differentiable. `medium`: what light passes
         through, a `jvr.march.medium.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""
 
@@ -62,7 +62,7 @@ class AbstractShadows(eqx.Module):
 
 
 class AbstractMaterial(eqx.Module):
-    """How a point sends light from all directions to the eye."""
+    """A material: how a point sends light from all directions to the eye."""
 
     @property
     @abc.abstractmethod
@@ -75,9 +75,9 @@ class AbstractMaterial(eqx.Module):
 
 
 class AbstractRadianceTransfer(eqx.Module):
-    """How the medium around a point changes the light that reaches it from all around."""
+    """Radiance transfer: how the medium around a point changes the light of the environment that reaches it."""
 
-    # Whether samples bring the light that reaches them, and not a share of all of it.
+    # Whether samples bring the light that reaches them, and not a fraction of all of it.
     exact: eqx.AbstractVar[bool]
     # What rays pick up on their way, or `None`.
     bleeding: eqx.AbstractVar[Any]
@@ -108,13 +108,13 @@ class AbstractRadianceTransfer(eqx.Module):
         """How far above a surface, in the world, it is known what arrives."""
 
     @abc.abstractmethod
-    def outdated(self, scene: Any) -> tuple[str, ...]:
-        """What has to be computed again for a scene of arrays at hand, in a sentence; empty where nothing has."""
+    def stale(self, scene: Any) -> tuple[str, ...]:
+        """What has to be computed again for a scene of concrete arrays, in a sentence; empty where nothing has."""
 
     @abc.abstractmethod
     def checked(self, scene: Any) -> "AbstractRadianceTransfer":
         """The same, for a scene that it has not been computed for an error: a `ValueError`, or, where that is traced, when the program
-        runs. Where it is `pinned` a warning, of arrays at hand."""
+        runs. Where it is `pinned` a warning, of concrete arrays."""
 
     @abc.abstractmethod
     def pinned(self) -> "AbstractRadianceTransfer":
@@ -125,7 +125,7 @@ class AbstractRadianceTransfer(eqx.Module):
         return ()
 
 
-def describe(part: Any) -> str:
+def spelling(part: Any) -> str:
     """A part of a scene with its static choices, such as `ShadowRays(step=1, termination=0.001)`; nothing for `None`."""
     if part is None:
         return ""

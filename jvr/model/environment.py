@@ -1,4 +1,4 @@
-"""Light from all around: radiance from far away as a function of direction, in spherical harmonics."""
+"""Environment lighting: radiance from far away as a function of direction, in spherical harmonics."""
 
 import math
 import os
@@ -19,7 +19,8 @@ from jvr.types import ArrayLike
 
 
 class EnvironmentLight(eqx.Module):
-    """Radiance that arrives from direction `d` (pointing away from the scene): `L_i(d) = sum_j c_j Y_j(d)`, the same at every point.
+    """An environment light: radiance that arrives from direction `d` (pointing away from the scene): `L_i(d) = sum_j c_j Y_j(d)`, the
+    same at every point.
 
     **Arguments:** `coefficients`: `((order + 1)^2, 3)`, linear RGB, of `jvr.sh`'s functions in the world's axes; differentiable. `clamped`:
     where the series rings below zero, what a sample reflects is cut off at zero; without it negative radiance may reach the picture.
@@ -83,8 +84,8 @@ class EnvironmentLight(eqx.Module):
         require(jnp.linalg.norm(axis), lambda n: np.isfinite(n) & (n > 0), "towards must be a direction, not zero")
         rgb = jnp.broadcast_to(radiances(radiance, "radiance"), (3,))
         kernel = jnp.stack(cap(2 * jnp.square(jnp.sin(jnp.deg2rad(angle) / 2)), order))
-        about = harmonics.evaluate(order, normalise(axis)[None])[0]
-        return cls(harmonics.convolve(about, kernel)[:, None] * rgb)
+        lobe = harmonics.evaluate(order, normalise(axis)[None])[0]
+        return cls(harmonics.convolve(lobe, kernel)[:, None] * rgb)
 
     @property
     def order(self) -> int:

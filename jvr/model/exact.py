@@ -1,4 +1,4 @@
-"""Positions in two floats.
+"""Double-float positions: the unevaluated sum of two numbers in single precision.
 
 A position far from the world's origin, or a direction that is followed over a great distance, has more digits than single precision
 holds. What a constructor is given in double precision it keeps as an array and its `Remainder`; differences of such positions are taken
@@ -44,7 +44,7 @@ class Remainder(eqx.Module):
 
 
 class Exact(NamedTuple):
-    """The unevaluated sum `high + low`."""
+    """A position as the unevaluated sum `high + low`."""
 
     high: Float[Array, "..."]
     low: Float[Array, "..."]

@@ -7,14 +7,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import colours, float_array, require
-from jvr.model.ranges import EXTINCTION, INCREASING, NOT_NEGATIVE, SHARE, within
+from jvr.model.ranges import EXTINCTION, INCREASING, NOT_NEGATIVE, UNIT_INTERVAL, within
 from jvr.model.transfer import AbstractTransfer, Classified, any_between
 from jvr.numerics import clamp, larger, smaller
 from jvr.types import ArrayLike, Channels, Scalar
 
 
 class GradientTransfer(AbstractTransfer):
-    """A table over the scalar and the length of its gradient, bilinear: materials by value, boundaries between them by gradient.
+    """A two-dimensional transfer function, a bilinear table over the scalar and the length of its gradient: materials by value,
+    boundaries between them by gradient.
 
     **Arguments:** `rgb`: `(n, m, 3)`, linear; `sigma_t`: `(n, m)` or, coloured, `(n, m, 3)`, per world length, not negative; `domain`:
     `(low, high)` scalars of the first and last row; `magnitudes`: `(low, high)` lengths of the gradient, in data units per world length,
@@ -24,7 +25,7 @@ class GradientTransfer(AbstractTransfer):
 
     takes_gradient: ClassVar[bool] = True
 
-    rgb: Float[Array, "n m 3"] = eqx.field(metadata=within(SHARE))
+    rgb: Float[Array, "n m 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
     sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
     domain: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
     magnitudes: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
@@ -53,10 +54,10 @@ class GradientTransfer(AbstractTransfer):
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
         # Whatever the length of the gradient: it depends on voxels farther away, too.
         n = self.rgb.shape[0]
-        lit = jnp.any(~(jnp.abs(self.sigma_t.reshape(n, -1)) <= least), axis=1)
+        visible = jnp.any(~(jnp.abs(self.sigma_t.reshape(n, -1)) <= least), axis=1)
         beyond = high < self.domain[0], low > self.domain[1]
         u, v = (_coordinate(s, self.domain, n) for s in (low, high))
-        return any_between(lit, u, v, beyond if nearby else None)
+        return any_between(visible, u, v, beyond if nearby else None)
 
 
 class GradientOpacity(AbstractTransfer):
@@ -89,9 +90,9 @@ class GradientOpacity(AbstractTransfer):
         # Clipped before the division: far outside of a narrow range the quotient would overflow.
         # At `low` the derivative is that of less: where there is no gradient and `low` is 0, both can only grow.
         clipped = smaller(larger(self.low, magnitude), self.high)
-        share = (clipped - self.low) / (self.high - self.low)
+        fraction = (clipped - self.low) / (self.high - self.low)
         rgb, sigma_t = self.transfer.evaluate(s)
-        scaled: Channels = tuple(sigma * share for sigma in sigma_t)
+        scaled: Channels = tuple(sigma * fraction for sigma in sigma_t)
         return Classified(rgb, scaled)
 
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:

@@ -1,4 +1,4 @@
-"""How volumes and transfer functions look in a notebook: a few small pictures and a line of words."""
+"""HTML of volumes and transfer functions for notebooks: a few small pictures and a line of words."""
 
 import base64
 from html import escape

@@ -1,4 +1,4 @@
-"""What a derived array was made of: by identity, or by the content.
+"""Cache keys of derived arrays: what one was made of, by identity or by content.
 
 What is computed once and kept beside the arrays that it was made of goes stale when one of these is replaced. JAX's arrays do not change,
 so that the very same array in the same place is proof that nothing was replaced; traced arrays prove nothing. Where computing anew is
@@ -39,7 +39,7 @@ _checksums: dict[int, tuple[weakref.ref, np.ndarray]] = {}
 
 
 def content(tree: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
-    """Checksums of the structure of a tree, with its static parts, and of each of its arrays. Arrays at hand are read once in their life,
+    """Checksums of the structure of a tree, with its static parts, and of each of its arrays. Concrete arrays are read once in their life,
     traced ones each time; no derivative goes through it."""
     arrays, structure = jax.tree.flatten(jax.lax.stop_gradient(tree))
     shapes = [(x.shape, str(x.dtype)) for x in arrays]

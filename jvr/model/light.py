@@ -1,4 +1,4 @@
-"""Lights: from where, and how much of it, light arrives at a point when nothing is in its way.
+"""Lights: direction and irradiance of what reaches a point when nothing is in its way.
 
 `direction` is the way that light travels, in the world; `irradiance` is power per unit area perpendicular to it. Colours are linear RGB, a
 single number is grey. Everything is differentiable.
@@ -23,10 +23,10 @@ from jvr.types import ArrayLike, Scalar, Triple, Vector
 ATTENUATION = Entries((POSITIVE, NOT_NEGATIVE, NOT_NEGATIVE))
 
 
-class Arrival(NamedTuple):
-    """Light at a point: unit direction towards the light, distance to it (infinite for directional light), irradiance."""
+class LightSample(NamedTuple):
+    """Light at a point: unit direction `w_i` towards the light, distance to it (infinite for directional light), irradiance."""
 
-    towards: Triple
+    w_i: Triple
     distance: Scalar
     irradiance: Triple
 
@@ -38,7 +38,7 @@ class AbstractLight(eqx.Module):
     casts_shadows: ClassVar[bool] = True
 
     @abc.abstractmethod
-    def arrives(self, x: Triple, w_o: Triple) -> Arrival:
+    def sample(self, x: Triple, w_o: Triple) -> LightSample:
         """Light at world position `x`, which is looked at from the unit direction `w_o` (to the eye)."""
 
     @abc.abstractmethod
@@ -47,7 +47,7 @@ class AbstractLight(eqx.Module):
 
 
 class DirectionalLight(AbstractLight):
-    """Parallel light, as from the sun.
+    """Directional light: parallel, as from the sun.
 
     **Arguments:** `direction`: `(3,)`, the way the light travels, of any length but zero; `irradiance`: a number or `(3,)`, not negative.
     """
@@ -59,9 +59,9 @@ class DirectionalLight(AbstractLight):
         self.direction = _direction(direction, "DirectionalLight")
         self.irradiance = _colour(irradiance, "irradiance")
 
-    def arrives(self, x: Triple, w_o: Triple) -> Arrival:
+    def sample(self, x: Triple, w_o: Triple) -> LightSample:
         travels, _ = direction_and_length(_three(self.direction))
-        return Arrival(tuple(-d for d in travels), jnp.full_like(x[0], jnp.inf), _rgb(self.irradiance))
+        return LightSample(tuple(-d for d in travels), jnp.full_like(x[0], jnp.inf), _rgb(self.irradiance))
 
     def moved(self, origin: Exact) -> "DirectionalLight":
         return self
@@ -99,10 +99,10 @@ class PointLight(AbstractLight):
         require(self.radius, POSITIVE.holds, "a light's radius must be positive: 1e-3 is a good start")
         self.attenuation = None if attenuation is None else _attenuation(attenuation)
 
-    def arrives(self, x: Triple, w_o: Triple) -> Arrival:
-        towards, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
+    def sample(self, x: Triple, w_o: Triple) -> LightSample:
+        w_i, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
         falloff = _falloff(distance, self.radius, self.attenuation)
-        return Arrival(towards, distance, tuple(i * falloff for i in _rgb(self.intensity)))
+        return LightSample(w_i, distance, tuple(i * falloff for i in _rgb(self.intensity)))
 
     def moved(self, origin: Exact) -> "PointLight":
         return _at(self, origin)
@@ -145,24 +145,24 @@ class SpotLight(AbstractLight):
         angles = jnp.stack([self.inner, self.outer])
         require(angles, lambda a: DEGREES.holds(a) & (a[0] < a[1]), "a SpotLight needs 0 <= inner < outer <= 180 degrees")
 
-    def arrives(self, x: Triple, w_o: Triple) -> Arrival:
-        towards, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
+    def sample(self, x: Triple, w_o: Triple) -> LightSample:
+        w_i, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
         axis, _ = direction_and_length(_three(self.direction))
         # With squares of sines of half the angles in place of cosines, which are all 1 in a narrow cone. That between axis and light is a
-        # quarter of `|axis + towards|^2`; that of `outer` less that of `inner` is a product.
+        # quarter of `|axis + w_i|^2`; that of `outer` less that of `inner` is a product.
         outer, inner = jnp.deg2rad(self.outer) / 2, jnp.deg2rad(self.inner) / 2
-        aside = 0.25 * sum(jnp.square(a + b) for a, b in zip(axis, towards, strict=True))
+        aside = 0.25 * sum(jnp.square(a + b) for a, b in zip(axis, w_i, strict=True))
         width = jnp.sin(outer + inner) * jnp.sin(outer - inner)
-        share = jnp.clip(divide_or_zero(jnp.square(jnp.sin(outer)) - aside, width), 0.0, 1.0)
-        falloff = share * share * (3 - 2 * share) * _falloff(distance, self.radius, self.attenuation)
-        return Arrival(towards, distance, tuple(i * falloff for i in _rgb(self.intensity)))
+        fraction = jnp.clip(divide_or_zero(jnp.square(jnp.sin(outer)) - aside, width), 0.0, 1.0)
+        falloff = fraction * fraction * (3 - 2 * fraction) * _falloff(distance, self.radius, self.attenuation)
+        return LightSample(w_i, distance, tuple(i * falloff for i in _rgb(self.intensity)))
 
     def moved(self, origin: Exact) -> "SpotLight":
         return _at(self, origin)
 
 
 class HeadLight(AbstractLight):
-    """Light that comes from the eye along each ray; it casts no shadows. `irradiance`: a number or `(3,)`, not negative."""
+    """A headlight: light that comes from the eye along each ray; it casts no shadows. `irradiance`: a number or `(3,)`, not negative."""
 
     casts_shadows: ClassVar[bool] = False
 
@@ -171,15 +171,15 @@ class HeadLight(AbstractLight):
     def __init__(self, irradiance: ArrayLike = 1.0):
         self.irradiance = _colour(irradiance, "irradiance")
 
-    def arrives(self, x: Triple, w_o: Triple) -> Arrival:
-        return Arrival(w_o, jnp.full_like(x[0], jnp.inf), _rgb(self.irradiance))
+    def sample(self, x: Triple, w_o: Triple) -> LightSample:
+        return LightSample(w_o, jnp.full_like(x[0], jnp.inf), _rgb(self.irradiance))
 
     def moved(self, origin: Exact) -> "HeadLight":
         return self
 
 
 class AmbientLight(eqx.Module):
-    """The same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
+    """Ambient light: the same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
 
     radiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
 

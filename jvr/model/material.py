@@ -1,6 +1,6 @@
 """Materials: how much of the light from each direction a point sends to the eye, in spherical harmonics.
 
-A material function `M(w_o, w_i)` includes the cosine of a surface; its integral over `w_i` is the share that is reflected. All are
+A material function `M(w_o, w_i)` includes the cosine of a surface; its integral over `w_i` is the fraction that is reflected. All are
 isotropic: with the normal as polar axis and the eye in the half-plane of azimuth 0, `M` is even in the azimuth of `w_i`, so that only the
 harmonics of `m >= 0` occur, with coefficients `rho_lm` that depend on the angle of the eye alone:
 
@@ -27,22 +27,22 @@ from jvr.types import ArrayLike, Channels, Scalar, Triple
 # The largest angle between the normal and the eye that materials are projected for.
 GRAZING = math.pi / 2 - 1e-3
 
-About: TypeAlias = Literal["normal", "eye", "both"]
+SymmetryAxis: TypeAlias = Literal["normal", "eye", "both"]
 
 
 class Lobe(eqx.Module):
     """`rho_lm` of one part of a material, for each class of the scalar and for polar angles of the eye that are equally distant from
-    0 to 90 degrees. `about`: what `M` is symmetric about: the `normal` or the `eye` (then there is one angle, and `m = 0` alone), or
-    the plane of `both`."""
+    0 to 90 degrees. `symmetry_axis`: what `M` is symmetric about: the `normal` or the `eye` (then there is one angle, and `m = 0` alone),
+    or the plane of `both`."""
 
     coefficients: Float[Array, "classes polar l m channels"]
-    about: About = eqx.field(static=True)
+    symmetry_axis: SymmetryAxis = eqx.field(static=True)
 
     def in_plane(self) -> "Lobe":
-        """The same with as many angles and `m` as a lobe about both has, so that it can stand beside one."""
-        if self.about == "eye":
+        """The same with as many angles and `m` as a lobe symmetric about the plane of both has, so that it can stand beside one."""
+        if self.symmetry_axis == "eye":
             raise ValueError("a phase function has no place beside surfaces in one material by value: split the scene")
-        if self.about == "both":
+        if self.symmetry_axis == "both":
             return self
         wide = jnp.pad(self.coefficients, ((0, 0),) * 3 + ((0, self.coefficients.shape[2] - 1), (0, 0)))
         return Lobe(wide, "both")
@@ -51,9 +51,9 @@ class Lobe(eqx.Module):
 class HarmonicMaterial(AbstractMaterial):
     """A material as coefficients, made by `HarmonicMaterial.project`.
 
-    `tinted` is multiplied with the colour of the transfer function, `plain` is not; each a `Lobe` or `None`. `positions`: scalars of the
-    classes, `(classes,)`, linear in between and constant beyond. `threshold`: as of `jvr.Lambert`: where the gradient is weak, what is
-    reflected depends less on direction, down to the mean over all directions. Coefficients are differentiable.
+    `tinted` is multiplied with the colour of the transfer function, `plain` is unmodulated; each a `Lobe` or `None`. `positions`: scalars
+    of the classes, `(classes,)`, linear in between and constant beyond. `threshold`: as of `jvr.Lambert`: where the gradient is weak, what
+    is reflected depends less on direction, down to the mean over all directions. Coefficients are differentiable.
     """
 
     tinted: Lobe | None
@@ -76,7 +76,7 @@ class HarmonicMaterial(AbstractMaterial):
         limit = float_array(threshold, "threshold", ())
         require(limit, NOT_NEGATIVE.holds, "threshold must be a length of the gradient, not negative")
         # The last angle is just above the horizon, where in either precision the eye is above the surface.
-        polar = np.array([0.0]) if brdf.about != "both" else np.minimum(np.linspace(0, math.pi / 2, directions), GRAZING)
+        polar = np.array([0.0]) if brdf.symmetry_axis != "both" else np.minimum(np.linspace(0, math.pi / 2, directions), GRAZING)
         w_i, weights = half_sphere_nodes(nodes)
         functions = jnp.stack([row for i, row in enumerate(basis(order, tuple(w_i.T))) if _degree(i) >= 0], axis=1)
 
@@ -87,8 +87,8 @@ class HarmonicMaterial(AbstractMaterial):
             return jax.tree.map(summed, values)
 
         parts = jax.vmap(at)(jnp.asarray(polar, limit.dtype))
-        tinted, plain = (_lobe(part, order, brdf.about) for part in parts)
-        return cls(tinted, plain, jnp.zeros(1, limit.dtype), limit)
+        tinted, unmodulated = (_lobe(part, order, brdf.symmetry_axis) for part in parts)
+        return cls(tinted, unmodulated, jnp.zeros(1, limit.dtype), limit)
 
     @property
     def order(self) -> int:
@@ -98,7 +98,7 @@ class HarmonicMaterial(AbstractMaterial):
     @property
     def needs_gradient(self) -> bool:
         """Whether what is reflected depends on a normal."""
-        return any(lobe is not None and lobe.about != "eye" for lobe in (self.tinted, self.plain))
+        return any(lobe is not None and lobe.symmetry_axis != "eye" for lobe in (self.tinted, self.plain))
 
     def projected(self, order: int) -> "HarmonicMaterial":
         return self
@@ -109,7 +109,7 @@ class AbstractBRDF(AbstractMaterial):
     fitted; `jvr.HarmonicMaterial.project` does it once."""
 
     # What it is symmetric about, see `Lobe`.
-    about: ClassVar[About]
+    symmetry_axis: ClassVar[SymmetryAxis]
 
     @abc.abstractmethod
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
@@ -118,7 +118,7 @@ class AbstractBRDF(AbstractMaterial):
 
     @property
     def needs_gradient(self) -> bool:
-        return self.about != "eye"
+        return self.symmetry_axis != "eye"
 
     def projected(self, order: int) -> HarmonicMaterial:
         return HarmonicMaterial.project(self, order)
@@ -151,8 +151,8 @@ class MaterialByValue(AbstractMaterial):
 
     def projected(self, order: int) -> HarmonicMaterial:
         parts = [m.projected(order) for m in self.materials]
-        tinted, plain = (_side_by_side([getattr(p, name) for p in parts]) for name in ("tinted", "plain"))
-        return HarmonicMaterial(tinted, plain, self.positions, parts[0].threshold)
+        tinted, unmodulated = (_side_by_side([getattr(p, name) for p in parts]) for name in ("tinted", "plain"))
+        return HarmonicMaterial(tinted, unmodulated, self.positions, parts[0].threshold)
 
 
 def half_sphere_nodes(nodes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -174,18 +174,18 @@ def _degree(index: int) -> int:
     return index - band * (band + 1)
 
 
-def _lobe(values: Channels, order: int, about: About) -> Lobe | None:
+def _lobe(values: Channels, order: int, symmetry_axis: SymmetryAxis) -> Lobe | None:
     """Coefficients `(polar, those of m >= 0)` of each channel as a `Lobe`."""
     if not values:
         return None
     stacked = jnp.stack(values, axis=-1)
-    widest = order + 1 if about == "both" else 1
+    widest = order + 1 if symmetry_axis == "both" else 1
     square = jnp.zeros((stacked.shape[0], order + 1, widest, stacked.shape[2]), stacked.dtype)
     places = [(math.isqrt(i), _degree(i)) for i in range((order + 1) ** 2) if _degree(i) >= 0]
     for k, (band, m) in enumerate(places):
         if m < widest:
             square = square.at[:, band, m].set(stacked[:, k])
-    return Lobe(square[None], about)
+    return Lobe(square[None], symmetry_axis)
 
 
 def _side_by_side(lobes: Sequence[Lobe | None]) -> Lobe | None:
@@ -193,11 +193,11 @@ def _side_by_side(lobes: Sequence[Lobe | None]) -> Lobe | None:
     there = [lobe for lobe in lobes if lobe is not None]
     if not there:
         return None
-    if len({lobe.about for lobe in there}) > 1:
+    if len({lobe.symmetry_axis for lobe in there}) > 1:
         there = [lobe.in_plane() for lobe in there]
     if len({lobe.coefficients.shape[2] for lobe in there}) > 1 or len({lobe.coefficients.shape[1] for lobe in there} - {1}) > 1:
         raise ValueError("materials side by side need one order and number of directions: project them alike")
     shape = np.broadcast_shapes(*[lobe.coefficients.shape for lobe in there])
     found: Any = iter(there)
     rows = [jnp.zeros(shape) if lobe is None else jnp.broadcast_to(next(found).coefficients, shape) for lobe in lobes]
-    return Lobe(jnp.concatenate(rows), there[0].about)
+    return Lobe(jnp.concatenate(rows), there[0].symmetry_axis)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jvr.model.brdf import above, of_one_shape, where_or_normal
 from jvr.model.checks import float_array, require
-from jvr.model.material import About, AbstractBRDF
+from jvr.model.material import AbstractBRDF, SymmetryAxis
 from jvr.model.ranges import NOT_NEGATIVE, within
 from jvr.numerics import direction_and_length, dot
 from jvr.types import ArrayLike, Channels, Triple
@@ -25,7 +25,7 @@ Numbers = Float[Array, "..."]
 
 
 class MerlBRDF(AbstractBRDF):
-    """Measured reflectance, plain: `M = table max(n . w_i, 0)`, three components.
+    """Measured reflectance, unmodulated: `M = table max(n . w_i, 0)`, three components.
 
     Entries are the middles of cells, even in `sqrt(theta_h)`, `theta_d` and `phi_d`; linear between them and constant in the outer halves
     of the first and last. Differentiable in the table and in the directions.
@@ -34,7 +34,7 @@ class MerlBRDF(AbstractBRDF):
     negative. **Raises** `ValueError` otherwise.
     """
 
-    about: ClassVar[About] = "both"
+    symmetry_axis: ClassVar[SymmetryAxis] = "both"
     table: Float[Array, "theta_h theta_d phi_d 3"] = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, table: ArrayLike):

@@ -30,7 +30,7 @@ DIAMETER = Interval(5.0, 50.0)
 
 
 class Draine(AbstractPhase):
-    """`p = HG(g) (1 + alpha cos^2 theta) / (1 + alpha (1 + 2 g^2) / 3)` (Draine 2003, ApJ 598, 1017).
+    """Draine's phase function, `p = HG(g) (1 + alpha cos^2 theta) / (1 + alpha (1 + 2 g^2) / 3)` (Draine 2003, ApJ 598, 1017).
 
     `alpha = 0` is Henyey-Greenstein; `g = 0`, `alpha = 1` is Rayleigh; `alpha = 1` is Cornette and Shanks 1992. The mean cosine is
     not `g`.
@@ -92,7 +92,7 @@ class JendersieEon(AbstractPhase):
 
 
 class TabulatedPhase(AbstractPhase):
-    """Measured or computed values at some angles, linear in `cos theta` between them and scaled to integrate to 1.
+    """A tabulated phase function: values at some angles, linear in `cos theta` between them and scaled to integrate to 1.
 
     **Arguments:** `angles`: `(n,)` in radians, strictly increasing from 0 (forward) to pi; `values`: `(n,)` or `(n, 3)`, not negative,
     in any unit. Differentiable in the values. **Raises** `ValueError` otherwise, and where all values are zero.
@@ -169,7 +169,7 @@ def _draine_mean(g: Numbers, alpha: Numbers) -> Numbers:
 def _draw_draine(g: Scalar, alpha: Scalar, u: Numbers) -> ScatteringAngle:
     """Inverts the distribution function by bisection.
 
-    The unknown is Henyey-Greenstein's own share of light `h`: in it the function is smooth, its slope between `1 / norm` and
+    The unknown is Henyey-Greenstein's own fraction of light `h`: in it the function is smooth, its slope between `1 / norm` and
     `(1 + alpha) / norm` for every `g`, where `cos theta` would need ever more digits for a narrow lobe. The published closed
     form, the root of a quartic, divides by `g^3` and `alpha`.
     """
@@ -181,7 +181,7 @@ def _draw_draine(g: Scalar, alpha: Scalar, u: Numbers) -> ScatteringAngle:
         v = 2.0 * near * h / (near + 2.0 * a * (1.0 - h))
         return v, v * (near + 0.5 * a * v)
 
-    def share(h: Numbers) -> Numbers:
+    def fraction(h: Numbers) -> Numbers:
         # Integration by parts: the integral of cos^2 dh is cos^2 h plus that of 2 h cos d(1 - cos), a polynomial in v.
         v, away = gap(h)
         rest = (1.0 + a) * v * v * (0.5 - near * v / 3.0 - 0.125 * a * v * v)
@@ -190,7 +190,7 @@ def _draw_draine(g: Scalar, alpha: Scalar, u: Numbers) -> ScatteringAngle:
     def halve(_: Int[Array, ""], bracket: tuple[Numbers, Numbers]) -> tuple[Numbers, Numbers]:
         low, high = bracket
         middle = 0.5 * (low + high)
-        above = share(middle) > wanted
+        above = fraction(middle) > wanted
         return jnp.where(above, low, middle), jnp.where(above, middle, high)
 
     digits = jnp.finfo(u.dtype).nmant + 2
@@ -219,9 +219,9 @@ def _draw_linear(
     wanted = (1.0 - u) * below[-1]
     # From the left: an interval without light is passed over.
     i = jnp.clip(jnp.searchsorted(below, wanted, side="left") - 1, 0, masses.shape[0] - 1)
-    share = jnp.clip(divide_or_zero(wanted - below[i], masses[i]), 0.0, 1.0)
+    fraction = jnp.clip(divide_or_zero(wanted - below[i], masses[i]), 0.0, 1.0)
     low, high = values[i], values[i + 1]
-    # The root of low x + (high - low) x^2 / 2 = share (low + high) / 2 in the form that does not cancel.
-    root = jnp.sqrt(jnp.maximum(low * low + share * (high * high - low * low), 0.0))
-    x = jnp.clip(divide_or_zero(share * (low + high), low + root), 0.0, 1.0)
+    # The root of low x + (high - low) x^2 / 2 = fraction (low + high) / 2 in the form that does not cancel.
+    root = jnp.sqrt(jnp.maximum(low * low + fraction * (high * high - low * low), 0.0))
+    x = jnp.clip(divide_or_zero(fraction * (low + high), low + root), 0.0, 1.0)
     return ScatteringAngle.of_gaps(one_minus[i] + x * widths[i], one_plus[i + 1] + (1.0 - x) * widths[i])

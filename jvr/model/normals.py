@@ -25,7 +25,7 @@ Resampled = tuple[Float[Array, "..."], Triple, Channels]
 
 
 class AbstractNormals(eqx.Module):
-    """How a gradient is estimated. With `of_opacity` it is that of the extinction, after the transfer function (mean of its channels),
+    """A gradient estimator. With `of_opacity` it is that of the extinction, after the transfer function (mean of its channels),
     else that of the scalar."""
 
     of_opacity: bool = eqx.field(static=True, default=False)
@@ -42,7 +42,7 @@ class AbstractNormals(eqx.Module):
     def gradient(self, transfer: AbstractTransfer, shape: tuple[int, int, int], p: Triple, resampled: Resampled) -> Triple:
         """Derivatives along the grid's axes at one position."""
 
-    def prepared(self, volume: Volume, transfer: AbstractTransfer) -> "AbstractNormals":
+    def with_gradients(self, volume: Volume, transfer: AbstractTransfer) -> "AbstractNormals":
         """The same with what can be computed before rays are marched; differentiable."""
         return self
 
@@ -66,9 +66,9 @@ class AnalyticGradient(AbstractNormals):
     for the gradient of the scalar.
     """
 
-    def prepared(self, volume: Volume, transfer: AbstractTransfer) -> AbstractNormals:
+    def with_gradients(self, volume: Volume, transfer: AbstractTransfer) -> AbstractNormals:
         if isinstance(volume.interpolation, Nearest) and not transfer.takes_gradient:
-            return PrecomputedGradient(of_opacity=True).prepared(volume, transfer)
+            return PrecomputedGradient(of_opacity=True).with_gradients(volume, transfer)
         return self
 
     def follows_transfer(self, volume: Volume) -> bool:
@@ -187,7 +187,7 @@ class PrecomputedGradient(AbstractNormals):
 
     gradients: Float[Array, "x y z 3"] | None = None
 
-    def prepared(self, volume: Volume, transfer: AbstractTransfer) -> "PrecomputedGradient":
+    def with_gradients(self, volume: Volume, transfer: AbstractTransfer) -> "PrecomputedGradient":
         if volume.gradients is not None and not self.of_opacity:
             return PrecomputedGradient(self.of_opacity, volume.gradients)
         values = volume.values.astype(volume.slope.dtype) * volume.slope + volume.intercept

@@ -11,10 +11,10 @@ from jvr.types import Channels, Scalar
 
 
 class AbstractOpticalModel(eqx.Module):
-    """How emission and extinction along a segment of length `dt` become radiance and optical depth."""
+    """An optical model: how emission and extinction along a segment of length `dt` become radiance and optical depth."""
 
     @abc.abstractmethod
-    def segment(self, medium: Classified, dt: Scalar) -> tuple[Channels, Channels]:
+    def evaluate_segment(self, classified: Classified, dt: Scalar) -> tuple[Channels, Channels]:
         """Radiance that leaves the segment (three components, or none where nothing is emitted) and its optical depth (one or
         three components, or none where nothing is absorbed)."""
 
@@ -26,22 +26,22 @@ class EmissionAbsorption(AbstractOpticalModel):
     the quotient's derivative cancel and would leave no digit of `exp(-dtau)`.
     """
 
-    def segment(self, medium: Classified, dt: Scalar) -> tuple[Channels, Channels]:
-        dtau = tuple(sigma * dt for sigma in medium.sigma_t)
+    def evaluate_segment(self, classified: Classified, dt: Scalar) -> tuple[Channels, Channels]:
+        dtau = tuple(sigma * dt for sigma in classified.sigma_t)
         opacity = tuple(one_minus_exp(d) for d in dtau)
-        return tuple(c * a for c, a in zip(medium.rgb, opacity * (3 // len(opacity)), strict=True)), dtau
+        return tuple(c * a for c, a in zip(classified.rgb, opacity * (3 // len(opacity)), strict=True)), dtau
 
 
 class EmissionOnly(AbstractOpticalModel):
     """A glowing, transparent medium: `j = sigma_t * rgb`, `T = 1`."""
 
-    def segment(self, medium: Classified, dt: Scalar) -> tuple[Channels, Channels]:
-        sigma_t = medium.sigma_t * (3 // len(medium.sigma_t))
-        return tuple(c * sigma * dt for c, sigma in zip(medium.rgb, sigma_t, strict=True)), ()
+    def evaluate_segment(self, classified: Classified, dt: Scalar) -> tuple[Channels, Channels]:
+        sigma_t = classified.sigma_t * (3 // len(classified.sigma_t))
+        return tuple(c * sigma * dt for c, sigma in zip(classified.rgb, sigma_t, strict=True)), ()
 
 
 class AbsorptionOnly(AbstractOpticalModel):
     """A cold medium that only attenuates what is behind it: `j = 0`."""
 
-    def segment(self, medium: Classified, dt: Scalar) -> tuple[Channels, Channels]:
-        return (), tuple(sigma * dt for sigma in medium.sigma_t)
+    def evaluate_segment(self, classified: Classified, dt: Scalar) -> tuple[Channels, Channels]:
+        return (), tuple(sigma * dt for sigma in classified.sigma_t)

@@ -9,8 +9,8 @@ from jvr.types import Triple
 
 
 class Squares(eqx.Module):
-    """Entry `(i, j, k)` holds the voxels `(i, j, k)`, `(i, j, k + 1)`, `(i, j + 1, k)` and `(i, j + 1, k + 1)`, a byte each from the
-    lowest on; beyond an edge, the edge's. A trilinear sample is two reads in place of four, for four bytes a voxel."""
+    """Voxels packed by fours: entry `(i, j, k)` holds the voxels `(i, j, k)`, `(i, j, k + 1)`, `(i, j + 1, k)` and `(i, j + 1, k + 1)`, a
+    byte each from the lowest on; beyond an edge, the edge's. A trilinear sample is two reads in place of four, for four bytes a voxel."""
 
     entries: UInt32[Array, "x y z"]
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jvr.model.by_value import ByValue
 from jvr.model.checks import float_array, require
-from jvr.model.ranges import ASYMMETRY, NOT_NEGATIVE, SHARE, within
+from jvr.model.ranges import ASYMMETRY, NOT_NEGATIVE, UNIT_INTERVAL, within
 from jvr.numerics import divide_or_zero
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
@@ -57,7 +57,7 @@ class ScatteringAngle(NamedTuple):
 
 
 class AbstractPhase(eqx.Module):
-    """A distribution of scattered light over the sphere."""
+    """A phase function: the distribution of scattered light over the sphere."""
 
     @abc.abstractmethod
     def evaluate(self, angle: ScatteringAngle) -> Channels:
@@ -102,7 +102,7 @@ class AbstractPhase(eqx.Module):
 
 
 class Isotropic(AbstractPhase):
-    """The same in all directions: `p = 1 / (4 pi)`."""
+    """The isotropic phase function: `p = 1 / (4 pi)`."""
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return (jnp.full_like(angle.cos, _UNIFORM),)
@@ -116,7 +116,8 @@ class Isotropic(AbstractPhase):
 
 
 class Rayleigh(AbstractPhase):
-    """Particles much smaller than the wavelength: `p = 3 / (16 pi) (1 + cos^2 theta)`, for unpolarised light."""
+    """Rayleigh's phase function, of particles much smaller than the wavelength: `p = 3 / (16 pi) (1 + cos^2 theta)`, for unpolarised
+    light."""
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return (0.75 * _UNIFORM * (1.0 + angle.cos * angle.cos),)
@@ -149,7 +150,7 @@ def sample_henyey_greenstein(g: Numbers, u: Numbers) -> ScatteringAngle:
 
 
 class HenyeyGreenstein(AbstractPhase):
-    """One lobe of asymmetry `g`, see `henyey_greenstein`; forward for `g > 0`, isotropic for `g = 0`.
+    """The Henyey-Greenstein phase function of asymmetry `g`, see `henyey_greenstein`; forward for `g > 0`, isotropic for `g = 0`.
 
     **Arguments:** `g`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either; differentiable. **Raises** `ValueError` otherwise.
     """
@@ -171,7 +172,7 @@ class HenyeyGreenstein(AbstractPhase):
 
 
 class DoubleHenyeyGreenstein(AbstractPhase):
-    """Two lobes, usually one forward and one backward: `weight HG(g1) + (1 - weight) HG(g2)`.
+    """Two Henyey-Greenstein lobes, usually one forward and one backward: `weight HG(g1) + (1 - weight) HG(g2)`.
 
     **Arguments:** `g1`, `g2` as for `HenyeyGreenstein`; `weight` of the first lobe, in [0, 1]; each `()` or `(3,)`, differentiable.
     **Raises** `ValueError` otherwise.
@@ -179,12 +180,12 @@ class DoubleHenyeyGreenstein(AbstractPhase):
 
     g1: Numbers = eqx.field(metadata=within(ASYMMETRY))
     g2: Numbers = eqx.field(metadata=within(ASYMMETRY))
-    weight: Numbers = eqx.field(metadata=within(SHARE))
+    weight: Numbers = eqx.field(metadata=within(UNIT_INTERVAL))
 
     def __init__(self, g1: ArrayLike | ByValue, g2: ArrayLike | ByValue, weight: ArrayLike):
         self.g1, self.g2 = asymmetry(g1, "g1"), asymmetry(g2, "g2")
         self.weight = float_array(weight, "weight", (), (3,))
-        require(self.weight, SHARE.holds, "weight, of the first lobe, must be in [0, 1]")
+        require(self.weight, UNIT_INTERVAL.holds, "weight, of the first lobe, must be in [0, 1]")
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return tuple(
@@ -208,7 +209,7 @@ class DoubleHenyeyGreenstein(AbstractPhase):
 
 
 class Schlick(AbstractPhase):
-    """`p = (1 - k^2) / (4 pi (1 - k cos theta)^2)` (Blasi, Le Saec and Schlick 1993), which needs no square root.
+    """Schlick's phase function, `p = (1 - k^2) / (4 pi (1 - k cos theta)^2)` (Blasi, Le Saec and Schlick 1993), which needs no square root.
 
     It resembles Henyey-Greenstein for `k = 1.55 g - 0.55 g^3` (Pharr and Humphreys 2004).
     **Arguments:** `k`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either, forward for `k > 0`; differentiable.
@@ -256,31 +257,31 @@ class Mixture(AbstractPhase):
         return self._mean([phase.evaluate(angle) for phase in self.phases])
 
     def draw(self, u: Numbers) -> tuple[ScatteringAngle, ...]:
-        shares, counts = self._shares(), [len(phase.mean_cosine) for phase in self.phases]
+        fractions, counts = self._fractions(), [len(phase.mean_cosine) for phase in self.phases]
         return tuple(
             choose(
                 u,
                 *(
-                    (shares[c % len(shares)][m], lambda v, p=phase, i=c % count: p.draw(v)[i])
+                    (fractions[c % len(fractions)][m], lambda v, p=phase, i=c % count: p.draw(v)[i])
                     for m, (phase, count) in enumerate(zip(self.phases, counts, strict=True))
                 ),
             )
-            for c in range(max(len(shares), *counts))
+            for c in range(max(len(fractions), *counts))
         )
 
     @property
     def mean_cosine(self) -> Channels:
         return self._mean([phase.mean_cosine for phase in self.phases])
 
-    def _shares(self) -> Channels:
-        shares = self.weights / jnp.sum(self.weights, axis=0)
-        return tuple(shares.reshape(len(self.phases), -1).T)
+    def _fractions(self) -> Channels:
+        fractions = self.weights / jnp.sum(self.weights, axis=0)
+        return tuple(fractions.reshape(len(self.phases), -1).T)
 
     def _mean(self, parts: list[Channels]) -> Channels:
-        shares = self._shares()
+        fractions = self._fractions()
         return tuple(
-            jnp.sum(jnp.stack([shares[c % len(shares)][m] * part[c % len(part)] for m, part in enumerate(parts)]), axis=0)
-            for c in range(max(len(shares), *map(len, parts)))
+            jnp.sum(jnp.stack([fractions[c % len(fractions)][m] * part[c % len(part)] for m, part in enumerate(parts)]), axis=0)
+            for c in range(max(len(fractions), *map(len, parts)))
         )
 
 
@@ -298,15 +299,15 @@ def components(*parameters: Numbers) -> tuple[Channels, ...]:
 
 
 def choose(u: Numbers, *lobes: tuple[Scalar, Callable[[Numbers], ScatteringAngle]]) -> ScatteringAngle:
-    """Spends `u` on the choice between lobes, each `(share, draw)` with shares that sum to 1, and what is left of it on `draw`."""
+    """Spends `u` on the choice between lobes, each `(fraction, draw)` with fractions that sum to 1, and what is left of it on `draw`."""
     if len(lobes) == 1:
         return lobes[0][1](u)
     chosen, below = ScatteringAngle(*(jnp.zeros_like(u),) * 3), jnp.zeros_like(u)
-    for share, draw in lobes:
-        rest = jnp.clip(divide_or_zero(u - below, jnp.broadcast_to(share, u.shape)), 0.0, 1.0)
-        here = (u >= below) & (share > 0)
+    for fraction, draw in lobes:
+        rest = jnp.clip(divide_or_zero(u - below, jnp.broadcast_to(fraction, u.shape)), 0.0, 1.0)
+        here = (u >= below) & (fraction > 0)
         chosen = ScatteringAngle(*(jnp.where(here, new, old) for new, old in zip(draw(rest), chosen, strict=True)))
-        below = below + share
+        below = below + fraction
     return chosen
 
 
@@ -323,12 +324,12 @@ def gap_to_axis(g: Numbers, angle: ScatteringAngle) -> Numbers:
 
 
 def lobe_coordinate(g: Numbers, u: Numbers) -> Numbers:
-    """Inverts `share = (1 + a) v / (2 (1 - a + a v))`, the share of light nearer to the axis than `v` of 0 ... 2.
+    """Inverts `fraction = (1 + a) v / (2 (1 - a + a v))`, the fraction of light nearer to the axis than `v` of 0 ... 2.
 
     `u` runs from backward to forward, so that draws are continuous in `g`.
     """
     a, near = magnitude(g)
-    # The share of light farther from the axis.
+    # The fraction of light farther from the axis.
     far = jnp.where(g < 0, 1.0 - u, u)
     return 2.0 * near * (1.0 - far) / (near + 2.0 * a * far)
 

@@ -51,8 +51,8 @@ class SegmentMeans(NamedTuple):
     lag: Triple
 
     def emit(self, optical: AbstractOpticalModel, dt: Scalar) -> tuple[Channels, Channels]:
-        """Radiance that leaves the segment of length `dt` and its optical depth, in the channels of `optical.segment`."""
-        emitted, dtau = optical.segment(Classified(self.rgb, self.sigma_t), dt)
+        """Radiance that leaves the segment of length `dt` and its optical depth, in the channels of `optical.evaluate_segment`."""
+        emitted, dtau = optical.evaluate_segment(Classified(self.rgb, self.sigma_t), dt)
         if not emitted:
             return emitted, dtau
         if not dtau:
@@ -63,13 +63,13 @@ class SegmentMeans(NamedTuple):
 
 
 class PreIntegratedTable(AbstractTransfer):
-    """A table with the means over its blocks of intervals, ready for `segment`. Made once, outside of a march's loop.
+    """A table with the means over its blocks of intervals, ready for `evaluate_segment`. Made once, outside of a march's loop.
 
     **Arguments:** `table`: `LinearTransfer` or `LutTransfer`; `parts`: how many equal parts of a segment its self-attenuation takes
     apart, a rule of order 4. Extinction, and emission without attenuation, are exact whatever `parts`.
 
     Memory: `n ceil(log2 n)` rows of 8 numbers, 10 for coloured extinction. Differentiable in every array of `table`.
-    **Raises** `TypeError` for another transfer function, `ValueError` where `parts` is not a positive whole number.
+    **Raises** `TypeError` for another transfer function, `ValueError` where `parts` is not a positive integer.
     """
 
     table: LinearTransfer | LutTransfer
@@ -84,7 +84,7 @@ class PreIntegratedTable(AbstractTransfer):
             raise ValueError(f"parts must be a positive whole number, not {parts}")
         self.table, self.parts = table, parts
         n = table.rgb.shape[0]
-        # An equally spaced table is measured in its own intervals: its entries sit at whole numbers, exactly.
+        # An equally spaced table is measured in its own intervals: its entries sit at integers, exactly.
         x = table.positions if isinstance(table, LinearTransfer) else jnp.arange(n, dtype=table.rgb.dtype)
         sigma_t = table.sigma_t.reshape(n, -1)
         # Both ends are repeated: outside of the table lies an interval of no width between equal entries.
@@ -97,9 +97,9 @@ class PreIntegratedTable(AbstractTransfer):
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
         return self.table.is_visible(low, high, least, nearby=nearby)
 
-    def segment(self, optical: AbstractOpticalModel, s0: Scalar, s1: Scalar, dt: Scalar) -> tuple[Channels, Channels]:
+    def evaluate_segment(self, optical: AbstractOpticalModel, s0: Scalar, s1: Scalar, dt: Scalar) -> tuple[Channels, Channels]:
         """Radiance that leaves a segment of length `dt` along which the scalar goes linearly from `s0` to `s1`, and its optical
-        depth, in the channels of `optical.segment`.
+        depth, in the channels of `optical.evaluate_segment`.
 
         Differentiable in everything. Where an end lies at an entry the derivative in the scalar is that of one side. The place of an
         entry between those of a `LutTransfer`'s domain is known to rounding: so is which side a scalar nearer than that lies on.
@@ -191,9 +191,9 @@ class _End(NamedTuple):
 
 class _Cut(NamedTuple):
     """How a segment divides into a first stretch (all of it, where both ends are in one interval), two blocks of whole intervals and
-    a last stretch: `first`, `block`, `block_too`, `last` are their shares of the segment, and `whole` says whether there are blocks.
+    a last stretch: `first`, `block`, `block_too`, `last` are their fractions of the segment, and `whole` says whether there are blocks.
 
-    `of_a`, `of_b`: weights of the entries below and above in the lower and in the upper end. `covers_a`, `covers_b`: the shares of
+    `of_a`, `of_b`: weights of the entries below and above in the lower and in the upper end. `covers_a`, `covers_b`: the fractions of
     their intervals that the stretches cover.
     """
 
@@ -267,14 +267,14 @@ def _ramp(sigma: Array, sigma_rise: Array, colour: Array, colour_rise: Array) ->
     return _Stretch(sigma, sigma * colour + sigma_rise * colour_rise * (1 / 12), lag)
 
 
-def _union(share: Array, one: _Stretch, share_too: Array, other: _Stretch) -> _Stretch:
-    """One stretch and then another, averaged over a whole of which they are these shares."""
-    sigma, sigma_too = share * one.sigma, share_too * other.sigma
-    emission, emission_too = share * one.emission, share_too * other.emission
+def _union(fraction: Array, one: _Stretch, fraction_too: Array, other: _Stretch) -> _Stretch:
+    """One stretch and then another, averaged over a whole of which they are these fractions."""
+    sigma, sigma_too = fraction * one.sigma, fraction_too * other.sigma
+    emission, emission_too = fraction * one.emission, fraction_too * other.emission
     # The middle of the union is farther back than that of the first by half of the other's depth, and the other way round.
     apart = 0.5 * (emission_too * sigma - emission * sigma_too)
     return _Stretch(
-        sigma + sigma_too, emission + emission_too, jnp.square(share) * one.lag + jnp.square(share_too) * other.lag + apart
+        sigma + sigma_too, emission + emission_too, jnp.square(fraction) * one.lag + jnp.square(fraction_too) * other.lag + apart
     )
 
 
@@ -285,7 +285,7 @@ _Channel = tuple[Scalar, Scalar, Scalar, Scalar]
 def _nearby(cut: _Cut, sigma: _Profile, colour: _Profile) -> _Channel:
     """Both ends in one interval, or in neighbouring ones.
 
-    The union of both stretches, in terms of the changes, which are exact where they are small: shares of a short segment are quotients
+    The union of both stretches, in terms of the changes, which are exact where they are small: fractions of a short segment are quotients
     of small lengths with large derivatives, and a difference of means beside them would be all rounding.
     """
     last = cut.last

@@ -1,4 +1,4 @@
-"""First pictures of one's own scan: a ramp by window and level, presets for CT in Hounsfield units, for scans whose values have no unit,
+"""Transfer function presets: a ramp by window and level, presets for CT in Hounsfield units, for scans whose values have no unit,
 and for labels.
 
 Extinctions are per millimetre, the unit of the world in every medical format.
@@ -124,11 +124,11 @@ def labels(count: int, *, sigma_t: float | int) -> LutTransfer:
 
 
 def _layers(
-    low: float | int, high: float | int, places: list[float], rgb: list[list[float]], sigma_t: np.ndarray
+    low: float | int, high: float | int, positions: list[float], rgb: list[list[float]], sigma_t: np.ndarray
 ) -> LinearTransfer:
     if not low < high:
         raise ValueError(f"a preset needs low < high, not {low:g} and {high:g}")
-    return LinearTransfer(low + (high - low) * np.asarray(places), rgb, sigma_t)
+    return LinearTransfer(low + (high - low) * np.asarray(positions), rgb, sigma_t)
 
 
 def _points(rows: list[tuple[float | int, ...]]) -> LinearTransfer:

@@ -70,7 +70,7 @@ Range: TypeAlias = Interval | UnitVector | Increasing | Entries
 ANY = Interval()
 NOT_NEGATIVE = Interval(low=0.0)
 POSITIVE = Interval(low=0.0, is_open=True)
-SHARE = Interval(0.0, 1.0)
+UNIT_INTERVAL = Interval(0.0, 1.0)
 ASYMMETRY = Interval(-1.0, 1.0, is_open=True)
 EXTINCTION = Interval(low=0.0, per_length=True)
 DEGREES = Interval(0.0, 180.0)
@@ -78,7 +78,7 @@ INCREASING = Increasing()
 
 
 def within(declared: Range) -> dict[str, Range]:
-    """The metadata of a field whose array takes values in a range: `eqx.field(metadata=within(SHARE))`."""
+    """The metadata of a field whose array takes values in a range: `eqx.field(metadata=within(UNIT_INTERVAL))`."""
     return {"range": declared}
 
 

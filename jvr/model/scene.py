@@ -10,14 +10,14 @@ from jvr.model.environment import EnvironmentLight
 from jvr.model.light import AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
-from jvr.model.ranges import SHARE, within
+from jvr.model.ranges import UNIT_INTERVAL, within
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import ClippingBox, Volume
 from jvr.types import ArrayLike, Vector
 
 
 class Scene(eqx.Module):
-    """What is rendered. A part that is `None` leaves no trace in the compiled program.
+    """A volume with transfer function, optical model and lighting. A part that is `None` leaves no trace in the compiled program.
 
     **Arguments:**
 
@@ -31,8 +31,8 @@ class Scene(eqx.Module):
     - `shadows`: how much of each light reaches a point: `jvr.ShadowRays`, `jvr.ShadowVolume`, `jvr.ShadowMap`, `jvr.OpacityShadowMap`,
       `jvr.DeepShadowMap`, or `None`: all of it.
     - `scattering`: what the medium makes of light: `jvr.SingleScattering` or `None`.
-    - `environment`: light from all around, far away: `jvr.EnvironmentLight` or `None`.
-    - `material`: what a point makes of the light from all around: a BRDF such as `jvr.MicrofacetBRDF(...)`, `jvr.HarmonicMaterial`,
+    - `environment`: light from far away in all directions: `jvr.EnvironmentLight` or `None`.
+    - `material`: what a point makes of the environment's light: a BRDF such as `jvr.MicrofacetBRDF(...)`, `jvr.HarmonicMaterial`,
       `jvr.MaterialByValue`, or `None`.
     - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
@@ -44,7 +44,7 @@ class Scene(eqx.Module):
 
     volume: Volume
     transfer: AbstractTransfer
-    background: Vector | None = eqx.field(metadata=within(SHARE))
+    background: Vector | None = eqx.field(metadata=within(UNIT_INTERVAL))
     optical: AbstractOpticalModel
     clipping: ClippingBox | None
     lights: tuple[AbstractLight | AmbientLight, ...]
@@ -150,10 +150,10 @@ def _check_light(scene: Scene) -> None:
 
 
 def _check_environment(scene: Scene) -> None:
-    """Light from all around, and what shows it."""
+    """Environment lighting, and what shows it."""
     if scene.environment is not None and scene.material is None:
         raise ValueError("nothing shows the environment: set material=jvr.LambertBRDF() or another material")
     if scene.material is not None and scene.environment is None:
-        raise ValueError("a material shows light from all around: set environment=jvr.EnvironmentLight.from_image(...)")
+        raise ValueError("a material shows environment lighting: set environment=jvr.EnvironmentLight.from_image(...)")
     if scene.radiance_transfer is not None and scene.environment is None:
         raise ValueError("radiance transfer is that of an environment: set environment= and material=, or leave it out")

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import colours, float_array, require
-from jvr.model.ranges import EXTINCTION, INCREASING, POSITIVE, SHARE, within
+from jvr.model.ranges import EXTINCTION, INCREASING, POSITIVE, UNIT_INTERVAL, within
 from jvr.numerics import clamp, divide_or_zero, read_run
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
@@ -64,13 +64,13 @@ class AbstractTable(AbstractTransfer):
         """Where `s` falls in the table, 0 ... n-1, clamped; entry `i` has weight `max(0, 1 - |coordinate - i|)`."""
 
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
-        lit = jnp.any(~(jnp.abs(self.sigma_t.reshape(self.sigma_t.shape[0], -1)) <= least), axis=1)
+        visible = jnp.any(~(jnp.abs(self.sigma_t.reshape(self.sigma_t.shape[0], -1)) <= least), axis=1)
         beyond = high < self.ends[0], low > self.ends[1]
-        return any_between(lit, self.coordinate(low), self.coordinate(high), beyond if nearby else None)
+        return any_between(visible, self.coordinate(low), self.coordinate(high), beyond if nearby else None)
 
 
 class LinearTransfer(AbstractTable):
-    """Piecewise linear between control points, constant beyond the first and the last.
+    """A piecewise linear transfer function: linear between control points, constant beyond the first and the last.
 
     **Arguments:** `positions`: `(n,)`, strictly increasing, in the data's units; `rgb`: `(n, 3)`, linear; `sigma_t`: `(n,)`, or
     `(n, 3)` for coloured extinction, per world length, not negative. All differentiable, positions too.
@@ -78,7 +78,7 @@ class LinearTransfer(AbstractTable):
     """
 
     positions: Float[Array, "n"] = eqx.field(metadata=within(INCREASING))
-    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(SHARE))
+    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
     sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
 
     def __init__(self, positions: ArrayLike, rgb: ArrayLike, sigma_t: ArrayLike):
@@ -108,13 +108,13 @@ class LinearTransfer(AbstractTable):
 
 
 class LutTransfer(AbstractTable):
-    """A table with equally spaced entries: entries 0 and n-1 sit at the ends of `domain`, values clamp outside of it.
+    """A lookup table with equally spaced entries: entries 0 and n-1 sit at the ends of `domain`, values clamp outside of it.
 
     **Arguments:** `rgb`: `(n, 3)`; `sigma_t`: `(n,)` or `(n, 3)`; `domain`: `(low, high)` in the data's units. All
     differentiable. **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
     """
 
-    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(SHARE))
+    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
     sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
     domain: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
 
@@ -146,7 +146,7 @@ class LutTransfer(AbstractTable):
 
 
 class GaussianTransfer(AbstractTransfer):
-    """A sum of Gaussians: `sigma_t(s) = sum_g height_g exp(-(s - center_g)^2 / (2 width_g^2))`, and as colour the mean of the
+    """A sum of Gaussians, `sigma_t(s) = sum_g height_g exp(-(s - center_g)^2 / (2 width_g^2))`, and as colour the mean of the
     Gaussians' colours, each weighted by its (mean) extinction. The weights are a softmax, so the colour stays defined where
     every Gaussian underflows. Where all heights are zero the weights do not depend on them: then the derivative in a height has
     the mean colour instead of its Gaussian's own.
@@ -158,7 +158,7 @@ class GaussianTransfer(AbstractTransfer):
     center: Float[Array, "g"]
     width: Float[Array, "g"] = eqx.field(metadata=within(POSITIVE))
     height: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
-    rgb: Float[Array, "g 3"] = eqx.field(metadata=within(SHARE))
+    rgb: Float[Array, "g 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
 
     def __init__(self, center: ArrayLike, width: ArrayLike, height: ArrayLike, rgb: ArrayLike):
         self.center = float_array(center, "center", (None,))
@@ -194,20 +194,20 @@ class GaussianTransfer(AbstractTransfer):
 
 
 def any_between(
-    lit: Bool[Array, "n"], u: Scalar, v: Scalar, beyond: tuple[Bool[Array, ""], Bool[Array, ""]] | None
+    visible: Bool[Array, "n"], u: Scalar, v: Scalar, beyond: tuple[Bool[Array, ""], Bool[Array, ""]] | None
 ) -> Bool[Array, ""]:
-    """Whether any entry is `lit` that has a weight in a table's coordinates `u` ... `v`, both clamped to 0 ... n-1.
+    """Whether any entry is `visible` that has a weight in a table's coordinates `u` ... `v`, both clamped to 0 ... n-1.
 
     Where `beyond` says whether what was clamped lies in front of the first entry and behind the last one, also those that have one next
     to `u` and `v`: at an entry both of its neighbours, beyond an end none.
     """
-    n = lit.shape[0]
+    n = visible.shape[0]
     first, last = jnp.floor(u), jnp.ceil(v)
     if beyond is not None:
         first = jnp.where(beyond[1], n - 1, jnp.maximum(jnp.ceil(u) - 1, 0))
         last = jnp.where(beyond[0], 0, jnp.minimum(jnp.floor(v) + 1, n - 1))
     # Entries are counted: a difference of sums of the extinctions themselves would round small ones away.
-    before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(lit, dtype=jnp.int32)])
+    before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(visible, dtype=jnp.int32)])
     return before[last.astype(jnp.int32) + 1] > before[first.astype(jnp.int32)]
 
 

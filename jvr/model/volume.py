@@ -207,7 +207,7 @@ class Volume(eqx.Module):
     def current(self) -> "Volume":
         """The same volume with what it keeps made anew where voxels, slope or intercept are not the very arrays that it was made of.
 
-        What draws a volume begins here, so that a part may be replaced like any other. Arrays at hand are told apart by identity, at no
+        What draws a volume begins here, so that a part may be replaced like any other. Concrete arrays are told apart by identity, at no
         cost. Traced ones are not: there bricks and gradients are made for each picture, the latter with their derivative, and squares
         where they do not hold the voxels.
         """
@@ -297,7 +297,7 @@ class Volume(eqx.Module):
         return value
 
     def data(self) -> np.ndarray:
-        """The stored voxels that hold data, `(n,)`, of arrays at hand."""
+        """The stored voxels that hold data, `(n,)`, of concrete arrays."""
         values = np.asarray(self.values).reshape(-1)
         return values if self.gaps is None else values[np.asarray(self.gaps).reshape(-1) & VOXEL == 0]
 
@@ -373,7 +373,7 @@ def _gradients(values: Voxels, slope: Scalar, intercept: Scalar) -> Float[Array,
 
 @jax.jit
 def _squares_if_other(values: Voxels, squares: Squares) -> Squares:
-    """The squares of these voxels: those at hand where they hold the same."""
+    """The squares of these voxels: the concrete ones where they hold the same."""
     same = jnp.all((squares.entries & 255).astype(jnp.uint8) == values)
     return jax.lax.cond(same, lambda: squares, lambda: squares_of(values))
 

@@ -18,7 +18,7 @@ VOXEL, CELL = 1, 2
 # Larger numbers are no measurement: files mark missing data with them.
 HUGE = 1e30
 # How far beside data a missing voxel can be part of a gradient.
-REACH = 2
+STENCIL = 2
 # Voxels that are filled at a time.
 SLAB = 1 << 18
 # Voxels that are so few and lie so far out that they are no part of the range of values.
@@ -160,9 +160,9 @@ def _filled(values: Num[np.ndarray, "x y z"], absent: Bool[np.ndarray, "x y z"])
     lowest = float(np.min(values, where=~absent, initial=np.inf if values.dtype.kind == "f" else np.iinfo(values.dtype).max))
     planes = max(SLAB // (values.shape[1] * values.shape[2]), 1)
     # All slabs have one size, so that they share a program.
-    filled, size = np.empty(values.shape, values.dtype), min(planes + 2 * REACH, len(values))
+    filled, size = np.empty(values.shape, values.dtype), min(planes + 2 * STENCIL, len(values))
     for start in range(0, len(values), planes):
-        first = min(max(start - REACH, 0), len(values) - size)
+        first = min(max(start - STENCIL, 0), len(values) - size)
         slab = _slab(jnp.asarray(values[first : first + size]), jnp.asarray(absent[first : first + size]), lowest)
         filled[start : start + planes] = slab[start - first : start - first + planes]
     return jnp.asarray(filled)
@@ -172,7 +172,7 @@ def _filled(values: Num[np.ndarray, "x y z"], absent: Bool[np.ndarray, "x y z"])
 def _slab(values: Num[Array, "x y z"], absent: Bool[Array, "x y z"], lowest: float | Float[Array, ""]) -> Num[Array, "x y z"]:
     kind = jnp.result_type(float)
     left, numbers = absent, jnp.where(absent, 0, values).astype(kind)
-    for _ in range(REACH):
+    for _ in range(STENCIL):
         count, total = _around((~left).astype(kind)), _around(jnp.where(left, 0.0, numbers))
         numbers, left = jnp.where(left & (count > 0), total / jnp.maximum(count, 1), numbers), left & (count == 0)
     numbers = jnp.where(left, jnp.where(jnp.isfinite(lowest), lowest, 0.0), numbers)
@@ -202,7 +202,7 @@ def _around(x: Num[Array, "x y z"]) -> Num[Array, "x y z"]:
 
 
 def typical_range(flat: np.ndarray, *, few: float = FEW, least: int = 1) -> tuple[float, float]:
-    """Smallest and largest of some numbers, but for a few that lie far out: no more than a share `few` of them, or `least`, more than
+    """Smallest and largest of some numbers, but for a few that lie far out: no more than a fraction `few` of them, or `least`, more than
     the range of all others but a few thousandths beyond it. One hot voxel does not decide what a range is cut into."""
     flat = flat.reshape(-1)
     low, high = float(flat.min()), float(flat.max())

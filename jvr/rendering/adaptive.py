@@ -1,5 +1,5 @@
-"""Pictures from samples that are far apart where a volume allows it, along the view and across it (Kraus, Strengert, Klein and Ertl,
-"Adaptive sampling in three dimensions for volume rendering on GPUs"; `jvr.march.slices` is the loop)."""
+"""Adaptive sampling: pictures from samples that are far apart where a volume allows it, along the view and across it (Kraus, Strengert,
+Klein and Ertl, "Adaptive sampling in three dimensions for volume rendering on GPUs"; `jvr.march.slices` is the loop)."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ from jvr.rendering.medium import is_lit
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Slices, SliceStats
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import ahead, develop, enter, near_volume, step_length
+from jvr.rendering.trace import ahead, enter, near_volume, resolve, step_length
 from jvr.types import Channels, Scalar
 
 # Bricks across which the oracle is asked to look: a picture whose pixels are larger than that is coarser than the volume anyway.
@@ -32,7 +32,7 @@ FARTHEST = 32
 UNIFORM = "leave Settings(sampling=...) at jvr.Uniform()"
 
 
-# Compiled as one program also where it is called with arrays at hand; inside another program it is a part of that.
+# Compiled as one program also where it is called with concrete arrays; inside another program it is a part of that.
 @jax.jit
 def render_slices(
     scene: Scene, camera: AbstractCamera, settings: Settings, sampling: Slices, *, distances: DistanceField | None = None
@@ -59,11 +59,11 @@ def render_slices(
     plane, dt = image_plane(camera, ahead(scene, camera)), step_length(scene, settings)
     period = 2**sampling.levels
     width, height = (-(-n // period) * period for n in (camera.width, camera.height))
-    options = SliceOptions(sampling.levels, width, height, settings.termination, _segment)
+    options = SliceOptions(sampling.levels, width, height, settings.termination, _evaluate_segments)
     lattice, finest, t_in = _lattice(scene, camera, plane, options, dt)
     if distances is None:
-        reach = _reach(scene, sampling, options, lattice, dt)
-        distances = distance_field(sampling.oracle, scene.volume, table, scene.optical, reach)
+        farthest = _farthest(scene, sampling, options, lattice, dt)
+        distances = distance_field(sampling.oracle, scene.volume, table, scene.optical, farthest)
 
     parts = settings.quadrature.parts if isinstance(settings.quadrature, PreIntegrated) else 1
     shading = (PreIntegratedTable(table, parts), scene.optical)
@@ -71,7 +71,7 @@ def render_slices(
     gathered, ended, samples = marched
 
     crop = lambda x: x.reshape(*options.shape(0), *x.shape[1:])[1 : camera.height + 1, 1 : camera.width + 1]
-    pixels, steps = jax.tree.map(crop, (develop(scene, gathered, finest, t_in), gathered.steps))
+    pixels, steps = jax.tree.map(crop, (resolve(scene, gathered, finest, t_in), gathered.steps))
     full = jnp.where(lattice.last >= 0, jnp.minimum(ended, lattice.last) - lattice.first + 1, 0)
     stats = RenderStats(steps, SliceStats(samples, jnp.sum(full, dtype=jnp.int32)))
     return Rendering(pixels.rgb, pixels.alpha, pixels.depth, stats)
@@ -98,16 +98,16 @@ def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
     return scene.transfer
 
 
-def _segment(shading: Any, lanes: tuple[Array, Array, Array]) -> tuple[Channels, Channels]:
+def _evaluate_segments(shading: Any, segments: tuple[Array, Array, Array]) -> tuple[Channels, Channels]:
     """Radiance and optical depth of segments along which the scalar changes linearly."""
     table, optical = shading
-    return jax.vmap(lambda front, back, length: table.segment(optical, front, back, length))(*lanes)
+    return jax.vmap(lambda front, back, length: table.evaluate_segment(optical, front, back, length))(*segments)
 
 
-def _reach(scene: Scene, sampling: Slices, options: SliceOptions, lattice: Lattice, dt: Scalar) -> Scalar:
+def _farthest(scene: Scene, sampling: Slices, options: SliceOptions, lattice: Lattice, dt: Scalar) -> Scalar:
     """How far the oracle has to look for a picture to make use of it."""
-    farthest = jnp.maximum(jnp.max(lattice.last), 0)
-    largest = jnp.maximum(dt, lattice.unit + farthest * lattice.unit_slope)
+    last = jnp.maximum(jnp.max(lattice.last), 0)
+    largest = jnp.maximum(dt, lattice.unit + last * lattice.unit_slope)
     across = thickness(scene.volume, sampling.oracle.brick)
     # A sample with twice the largest distance is the coarsest there is.
     return jnp.minimum(2 * options.period * largest, FARTHEST * jnp.minimum(jnp.minimum(across[0], across[1]), across[2]))

@@ -12,7 +12,7 @@ import numpy as np
 from jvr.march.quadrature import Midpoint
 from jvr.model.by_value import ByValue
 from jvr.model.camera import AbstractCamera
-from jvr.model.effects import describe
+from jvr.model.effects import spelling
 from jvr.model.gradient_transfer import GradientOpacity
 from jvr.model.light import AbstractLight, AmbientLight
 from jvr.model.normals import AnalyticGradient
@@ -108,22 +108,22 @@ def effects_of(scene: Scene) -> Iterator[tuple[str, Change]]:
     """Every effect that a scene may do without, and how."""
     lit = scene.shading is not None or scene.scattering is not None
     if scene.shadows is not None:
-        yield f"shadows {describe(scene.shadows)}", lambda s, settings: (dataclasses.replace(s, shadows=None), settings)
+        yield f"shadows {spelling(scene.shadows)}", lambda s, settings: (dataclasses.replace(s, shadows=None), settings)
     if scene.shading is not None:
-        yield f"shading {describe(scene.shading)}", lambda s, settings: (_without(s, shading=None), settings)
+        yield f"shading {spelling(scene.shading)}", lambda s, settings: (_without(s, shading=None), settings)
     if scene.scattering is not None:
-        yield f"scattering {describe(scene.scattering)}", lambda s, settings: (_without(s, scattering=None), settings)
+        yield f"scattering {spelling(scene.scattering)}", lambda s, settings: (_without(s, scattering=None), settings)
     if isinstance(scene.transfer, GradientOpacity):
         inner = scene.transfer.transfer
         yield "gradient opacity", lambda s, settings: (dataclasses.replace(s, transfer=inner), settings)
     if scene.radiance_transfer is not None:
         yield (
-            f"radiance transfer {describe(scene.radiance_transfer)}",
+            f"radiance transfer {spelling(scene.radiance_transfer)}",
             lambda s, x: (dataclasses.replace(s, radiance_transfer=None), x),
         )
     if scene.environment is not None:
         none = {"environment": None, "material": None, "radiance_transfer": None}
-        yield f"environment and material {describe(scene.material)}", lambda s, x: (dataclasses.replace(s, **none), x)
+        yield f"environment and material {spelling(scene.material)}", lambda s, x: (dataclasses.replace(s, **none), x)
     for i, light in enumerate(scene.lights if lit and len(scene.lights) > 1 else ()):
         keep = lambda s, settings, light=light: (_without(s, lights=tuple(x for x in s.lights if x is not light)), settings)
         yield f"lights[{i}] {type(light).__name__}", keep
@@ -142,16 +142,16 @@ def _coarser(scene: Scene, settings: Settings) -> Iterator[tuple[str, Change]]:
     """What has a knob, one notch coarser."""
     if scene.shadows is not None:
         for coarser in scene.shadows.coarser():
-            yield f"shadows = {describe(coarser)}", lambda s, x, new=coarser: (dataclasses.replace(s, shadows=new), x)
+            yield f"shadows = {spelling(coarser)}", lambda s, x, new=coarser: (dataclasses.replace(s, shadows=new), x)
     if scene.radiance_transfer is not None:
         for coarser in scene.radiance_transfer.coarser():
             yield (
-                f"radiance transfer = {describe(coarser)}",
+                f"radiance transfer = {spelling(coarser)}",
                 lambda s, x, new=coarser: (dataclasses.replace(s, radiance_transfer=new), x),
             )
     if type(scene.normals) is not AnalyticGradient:
         analytic = AnalyticGradient(scene.normals.of_opacity)
-        yield f"normals = {describe(analytic)}", lambda s, x: (dataclasses.replace(s, normals=analytic), x)
+        yield f"normals = {spelling(analytic)}", lambda s, x: (dataclasses.replace(s, normals=analytic), x)
     if isinstance(settings.quadrature, Midpoint):
         yield f"step = {2 * settings.step:g}", lambda s, x: (s, dataclasses.replace(x, step=2 * x.step))
     if settings.termination < 1e-2:
@@ -231,7 +231,7 @@ def remarks_on(scene: Scene, shadow_stats: Any) -> Iterator[str]:
     if scene.environment is not None and not np.any(np.asarray(scene.environment.coefficients)):
         yield "environment has no strength: it is computed and adds nothing"
     if scene.radiance_transfer is not None:
-        yield from scene.radiance_transfer.outdated(scene)
+        yield from scene.radiance_transfer.stale(scene)
     if shadow_stats is not None and float(shadow_stats.overflow) > 0:
         share, error = float(shadow_stats.overflow), float(shadow_stats.error)
         yield f"{share:.0%} of the rays of a deep shadow map ran out of layers (error {error:.2g}): give it more"

@@ -15,7 +15,7 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.sampling import RefinementStats, SliceStats
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Pixels, Seen, develop, seen, trace
+from jvr.rendering.trace import Pixels, Prepared, prepare, resolve, trace
 from jvr.types import Image
 
 
@@ -95,22 +95,22 @@ def _render(scene: Scene, camera: AbstractCamera, settings: Settings) -> Renderi
     height, width = camera.height, camera.width
     most = settings.tile // math.prod(block_shape(height, width))
 
-    def share(shared: tuple[Scene, AbstractCamera, Seen], blocks: Int[Array, "blocks"]) -> tuple[Pixels, Int[Array, "rays"]]:
+    def share(shared: tuple[Scene, AbstractCamera, Prepared], blocks: Int[Array, "blocks"]) -> tuple[Pixels, Int[Array, "rays"]]:
         return in_tiles(lambda tile: _render_blocks(*shared, settings, tile), blocks, most)
 
-    prepared, dealt = seen(scene, settings), dealt_blocks(height, width, shares())
+    prepared, dealt = prepare(scene, settings), dealt_blocks(height, width, shares())
     rays = everywhere(over_rays(share, (scene, camera, prepared), dealt))
     (rgb, alpha, depth), steps = picture_of(rays, height, width, shares())
     return Rendering(rgb, alpha, depth, RenderStats(steps, shadows=prepared.shadow_stats))
 
 
 def _render_blocks(
-    scene: Scene, camera: AbstractCamera, prepared: Seen, settings: Settings, blocks: Int[Array, "blocks"]
+    scene: Scene, camera: AbstractCamera, prepared: Prepared, settings: Settings, blocks: Int[Array, "blocks"]
 ) -> tuple[Pixels, Int[Array, "rays"]]:
     pixels = pixels_of(blocks, camera.height, camera.width)
-    gathered, rays, t_in = trace(scene, camera, settings, pixels, where=prepared, distance=True)
+    gathered, rays, t_in = trace(scene, camera, settings, pixels, prepared=prepared, distance=True)
     assert gathered.steps is not None
-    return develop(scene, gathered, rays, t_in), gathered.steps
+    return resolve(scene, gathered, rays, t_in), gathered.steps
 
 
 _picture = program(_render, static_argnums=2)

@@ -1,4 +1,4 @@
-"""What accuracy costs in time: pictures and gradients under several settings, against a reference."""
+"""Work-precision measurements: pictures and gradients under several settings, against a reference."""
 
 import dataclasses
 import statistics

@@ -1,4 +1,4 @@
-"""What rays march through for a scene: what the scene does not name is not in it.
+"""From a scene to the medium that rays march through: what the scene does not name is not in it.
 
 Modules of effects are imported here and only for scenes that hold them; everything else about them is behind the interfaces of
 `jvr.model.effects`.
@@ -30,15 +30,15 @@ def medium(
     settings: Settings,
     occupancy: Occupancy | None = None,
     shadows: AbstractVisibility | None = None,
-    natural: Any = None,
+    environment: Any = None,
 ) -> Medium:
-    """What of a scene rays march through: what the scene does not name is not in it. The last three are those of `Seen`."""
+    """What of a scene rays march through: what the scene does not name is not in it. The last three are those of `Prepared`."""
     frame, normals = _gradients(scene)
     field = VoxelField(scene.volume, normals)
     quadrature = settings.quadrature
     pre_integrated = isinstance(quadrature, PreIntegrated)
     if is_lit(scene):
-        shader = _lit_shader(scene, frame, pre_integrated, natural)
+        shader = _lit_shader(scene, frame, pre_integrated, environment)
     else:
         shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
     if not isinstance(quadrature, PreIntegrated):
@@ -53,17 +53,17 @@ def is_lit(scene: Scene) -> bool:
     return scene.shading is not None or scene.scattering is not None or scene.material is not None
 
 
-def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool, natural: Any) -> AbstractShader:
+def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool, environment: Any) -> AbstractShader:
     from jvr.effects.cut import CutFaces
     from jvr.effects.lighting import LitPreIntegratedShader, LitShader
 
     kind = LitPreIntegratedShader if pre_integrated else LitShader
     ambient = tuple(light for light in scene.lights if isinstance(light, AmbientLight))
-    lights, volume = arriving_lights(scene), scene.volume
+    lights, volume = delta_lights(scene), scene.volume
     cut = None
     if scene.clipping is not None and frame is not None:
         cut = CutFaces(scene.clipping, jnp.min(volume.spacing))
-    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering, cut, natural)
+    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering, cut, environment)
 
 
 def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
@@ -72,9 +72,9 @@ def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | No
         return None, None
     if scene.normals.of_opacity and scene.transfer.takes_gradient:
         raise ValueError("a transfer function of the gradient needs that of the scalar: set normals=...(of_opacity=False)")
-    normals = scene.normals.prepared(scene.volume, scene.transfer)
+    normals = scene.normals.with_gradients(scene.volume, scene.transfer)
     volume = scene.volume
-    # The arrays that were prepared stay with the field.
+    # The gradients that were computed stay with the field.
     return GradientFrame(eqx.filter(normals, False), volume.axes_inverse, volume.intercept, volume.shape), normals
 
 
@@ -89,8 +89,8 @@ def scatters_by_gradient(scene: Scene) -> bool:
     return scene.scattering is not None and scene.scattering.needs_gradient
 
 
-def arriving_lights(scene: Scene) -> tuple[AbstractLight, ...]:
-    """The lights that come from one direction at each point."""
+def delta_lights(scene: Scene) -> tuple[AbstractLight, ...]:
+    """The lights that come from one direction at each point (delta lights)."""
     return tuple(light for light in scene.lights if isinstance(light, AbstractLight))
 
 
@@ -106,13 +106,13 @@ def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility 
     shadows = None
     if scene.shadows is not None:
         medium = absorbing(scene, occupancy, scene.transfer.takes_gradient)
-        shadows = scene.shadows.prepared(scene, arriving_lights(scene), medium, jnp.min(scene.volume.spacing))
+        shadows = scene.shadows.visibility(scene, delta_lights(scene), medium, jnp.min(scene.volume.spacing))
     if scene.radiance_transfer is None:
         return shadows
-    from jvr.effects.transfer_grid import transfer_visibility
+    from jvr.effects.radiance_transfer_grid import radiance_transfer_visibility
 
     medium = absorbing(scene, occupancy, scene.transfer.takes_gradient or scene.radiance_transfer.needs_gradient)
-    return transfer_visibility(scene, medium, shadows, len(arriving_lights(scene)))
+    return radiance_transfer_visibility(scene, medium, shadows, len(delta_lights(scene)))
 
 
 def absorbing(scene: Scene, occupancy: Occupancy | None, graded: bool) -> Medium:
@@ -122,13 +122,13 @@ def absorbing(scene: Scene, occupancy: Occupancy | None, graded: bool) -> Medium
     return Medium(VoxelField(scene.volume, normals), scene.transfer, shader, occupancy)
 
 
-def natural(scene: Scene) -> Any:
-    """The material under light from all around, or `None` without one. Made once for a picture."""
+def environment(scene: Scene) -> Any:
+    """The material under environment lighting, or `None` without one. Made once for a picture."""
     if scene.material is None:
         return None
-    from jvr.effects.natural_light import natural_light_of
+    from jvr.effects.environment_lighting import environment_lighting_of
 
-    return natural_light_of(scene)
+    return environment_lighting_of(scene)
 
 
 def occupancy(scene: Scene, settings: Settings) -> Occupancy | None:

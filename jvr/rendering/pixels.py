@@ -1,4 +1,4 @@
-"""Rays through points of the image plane that are no pixel centres, inside of the picture and around it."""
+"""The image plane: rays through points of it that are no pixel centres, inside of the picture and around it."""
 
 import dataclasses
 from typing import NamedTuple
@@ -19,7 +19,7 @@ class ImagePlane(NamedTuple):
     ahead: Scalar
 
     def rays(self, column: Float[Array, "points"], row: Float[Array, "points"]) -> tuple[Triple, Triple, Float[Array, "points"]]:
-        """Points on the plane, unit directions, and distances from the eye; whole numbers are pixel centres, as in
+        """Points on the plane, unit directions, and distances from the eye; integers are pixel centres, as in
         `AbstractCamera.rays_ahead` up to rounding."""
         at = lambda v: tuple(start + column * across + row * down for start, across, down in v)
         origin, direction = at(self.origin), at(self.direction)

@@ -6,12 +6,12 @@ import jax
 
 from jvr.execution.devices import cores, shares
 from jvr.march.quadrature import PreIntegrated
-from jvr.model.effects import describe
+from jvr.model.effects import spelling
 from jvr.model.light import AmbientLight
 from jvr.model.optical import EmissionOnly
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.rendering.medium import arriving_lights, scatters_by_gradient
+from jvr.rendering.medium import delta_lights, scatters_by_gradient
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
 
@@ -46,7 +46,7 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What a rendering compiles to. Equal plans compile to the same program; `print` explains it."""
+    """The plan of a rendering: what it compiles to. Equal plans compile to the same program; `print` explains it."""
 
     parts: tuple[Part, ...]
     key: str
@@ -111,18 +111,18 @@ def _light_parts(scene: Scene) -> tuple[Part, ...]:
         "transfer": scene.transfer.takes_gradient,
     }
     asking = " and ".join(name for name, there in asks.items() if there)
-    gradient = f"{describe(scene.normals)}, asked for by {asking}" if asking else "nothing asks for a gradient"
-    casting = sum(light.casts_shadows for light in arriving_lights(scene))
-    shaded = none if shadows is None else f"{describe(shadows)} for {casting} light{'s' * (casting != 1)}"
+    gradient = f"{spelling(scene.normals)}, asked for by {asking}" if asking else "nothing asks for a gradient"
+    casting = sum(light.casts_shadows for light in delta_lights(scene))
+    shaded = none if shadows is None else f"{spelling(shadows)} for {casting} light{'s' * (casting != 1)}"
     by_gradient = ("lights", "gradient")
     return (
         Part("lights", shows and bool(lights), shown if lights else none),
-        Part("shading", shading is not None, describe(shading) or none, by_gradient if shading is not None else ()),
+        Part("shading", shading is not None, spelling(shading) or none, by_gradient if shading is not None else ()),
         Part("shadows", shadows is not None, shaded, ("light march",) if shadows is not None else ()),
         Part(
             "scattering",
             scattering is not None,
-            describe(scattering) or none,
+            spelling(scattering) or none,
             by_gradient[: 1 + asks["scattering"]] if scattering else (),
         ),
         *_environment_parts(scene),
@@ -131,19 +131,30 @@ def _light_parts(scene: Scene) -> tuple[Part, ...]:
 
 
 def _environment_parts(scene: Scene) -> tuple[Part, ...]:
-    """Light from all around, the material that shows it, and what is in its way."""
-    environment, material, transfer, none = scene.environment, scene.material, scene.radiance_transfer, "the scene names none"
-    around = none if environment is None else f"light from all around, {len(environment.coefficients)} coefficients"
+    """Environment lighting, the material that shows it, and what is in its way."""
+    environment, material, radiance_transfer, none = (
+        scene.environment,
+        scene.material,
+        scene.radiance_transfer,
+        "the scene names none",
+    )
+    around = none if environment is None else f"environment lighting, {len(environment.coefficients)} coefficients"
     needs = ("environment", "gradient") if material is not None and material.needs_gradient else ("environment",)
-    shown = none if material is None else describe(material)
-    made = "" if transfer is None else "computed beforehand" if transfer.is_frozen else "computed in each picture: jvr.precompute"
+    shown = none if material is None else spelling(material)
+    made = (
+        ""
+        if radiance_transfer is None
+        else "computed beforehand"
+        if radiance_transfer.is_frozen
+        else "computed in each picture: jvr.precompute"
+    )
     return (
         Part("environment", environment is not None, around),
         Part("material", material is not None, shown, needs if material is not None else ()),
         Part(
             "radiance transfer",
-            transfer is not None,
-            f"{describe(transfer)}, {made}" if transfer is not None else none,
-            ("environment", "light march") if transfer is not None else (),
+            radiance_transfer is not None,
+            f"{spelling(radiance_transfer)}, {made}" if radiance_transfer is not None else none,
+            ("environment", "light march") if radiance_transfer is not None else (),
         ),
     )

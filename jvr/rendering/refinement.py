@@ -1,4 +1,4 @@
-"""Pictures from rays that are far apart where the picture is smooth.
+"""Progressive refinement: pictures from rays that are far apart where the picture is smooth.
 
 Pixels are visited on grids whose spacing is halved from one to the next. A pixel between those of the grid before is predicted by
 bilinear interpolation. All pixels of the first two grids are traced, after that only those next to one whose prediction was wrong by
@@ -21,7 +21,7 @@ from jvr.rendering.medium import medium
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Refinement, RefinementStats
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Seen, ahead, composite, enter, near_volume, seen, step_length
+from jvr.rendering.trace import Prepared, ahead, composite, enter, near_volume, prepare, step_length
 
 
 class _Grid(NamedTuple):
@@ -40,7 +40,7 @@ class _Picture(NamedTuple):
     traced: Bool[Array, "pixels"]
 
 
-# Compiled as one program also where it is called with arrays at hand; inside another program it is a part of that.
+# Compiled as one program also where it is called with concrete arrays; inside another program it is a part of that.
 @jax.jit
 def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sampling: Refinement) -> Rendering:
     """Renders `scene` as `camera` sees it, tracing the rays that `sampling` chooses and interpolating between them.
@@ -57,12 +57,12 @@ def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sam
     height, width = (-(-(n - 1) // tile) * tile + 1 for n in (camera.height, camera.width))
     row, column = (x.reshape(-1) for x in jnp.meshgrid(*(jnp.arange(n, dtype=jnp.int32) for n in (height, width)), indexing="ij"))
     grid = _Grid(column, row, (height, width))
-    where = seen(scene, settings)
+    prepared = prepare(scene, settings)
 
     def refine(picture: _Picture, spacing: Int[Array, ""]) -> tuple[_Picture, Int[Array, "pixels"]]:
         fine, coarse = (~((row % s > 0) | (column % s > 0)) for s in (spacing, 2 * spacing))
         between, mask = fine & ~coarse, fine & picture.wanted & ~picture.traced
-        found, steps = _trace(scene, plane, settings, where, grid, mask)
+        found, steps = _trace(scene, plane, settings, prepared, grid, mask)
         # On the first pass the grid that predictions are made from is new, too.
         values = jnp.where((mask & coarse)[:, None], found, picture.values)
         values = jnp.where(between[:, None], _predict(values, grid, 2 * spacing), values)
@@ -84,11 +84,11 @@ def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sam
     alpha = values[..., 3]
     depth = jnp.where(alpha > 0, divide_or_zero(values[..., 4], alpha), 0.0)
     stats = RefinementStats(traced, jnp.sum(picture.traced, dtype=jnp.int32))
-    return Rendering(values[..., :3], alpha, depth, RenderStats(steps, stats, where.shadow_stats))
+    return Rendering(values[..., :3], alpha, depth, RenderStats(steps, stats, prepared.shadow_stats))
 
 
 def _trace(
-    scene: Scene, plane: ImagePlane, settings: Settings, where: Seen, grid: _Grid, mask: Bool[Array, "pixels"]
+    scene: Scene, plane: ImagePlane, settings: Settings, prepared: Prepared, grid: _Grid, mask: Bool[Array, "pixels"]
 ) -> tuple[Float[Array, "pixels 5"], Int[Array, "pixels"]]:
     """Colour, opacity and opacity-weighted depth of the pixels of a mask, and their steps."""
     column, row = (x.astype(scene.volume.slope.dtype) for x in (grid.column, grid.row))
@@ -96,7 +96,7 @@ def _trace(
     # A ray without length is not marched.
     rays = rays._replace(length=jnp.where(mask, rays.length, 0.0))
     options = MarchOptions(settings.termination, True)
-    gathered = settings.adjoint.march(options, medium(scene, settings, *where), rays, step_length(scene, settings))
+    gathered = settings.adjoint.march(options, medium(scene, settings, *prepared), rays, step_length(scene, settings))
     rgb, alpha = composite(scene, gathered, rays.length)
     weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
     assert gathered.steps is not None

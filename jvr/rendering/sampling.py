@@ -30,7 +30,7 @@ class AbstractSampling(eqx.Module):
 
 
 class Uniform(AbstractSampling):
-    """Every pixel's ray, and every sample of a ray that can be seen. The default."""
+    """Uniform sampling: every pixel's ray, and every sample of a ray that can be seen. The default."""
 
     @property
     def explanation(self) -> str:
@@ -43,8 +43,8 @@ class Uniform(AbstractSampling):
 
 
 class Slices(AbstractSampling):
-    """Samples on slices across the view, far apart where an oracle allows it, along the view and across it; between them the scalar is
-    interpolated, by B-splines across the view and by pre-integration along it (`jvr.rendering.adaptive`).
+    """Adaptive sampling on slices across the view, far apart where an oracle allows it, along the view and across it; between them the
+    scalar is interpolated, by B-splines across the view and by pre-integration along it (`jvr.rendering.adaptive`).
 
     **Arguments:** `oracle`: says how far apart samples may be, within its tolerance: `jvr.LocalError()` (default),
     `jvr.OpacityChange()`, `jvr.BrickRange()`, or `jvr.Finest()`, which allows nothing. `levels`: samples are at most `2^levels` slices
@@ -75,8 +75,8 @@ class Slices(AbstractSampling):
 
 
 class Refinement(AbstractSampling):
-    """Rays far apart where the picture is smooth: first every `tile`-th and `tile / 2`-th pixel, in rows and in columns, then those
-    between where interpolation was wrong by more than `tolerance` (`jvr.rendering.refinement`).
+    """Progressive refinement, rays far apart where the picture is smooth: first every `tile`-th and `tile / 2`-th pixel, in rows and in
+    columns, then those between where interpolation was wrong by more than `tolerance` (`jvr.rendering.refinement`).
 
     **Arguments:** `tolerance`: in radiance and opacity, 0 (every ray) or more. It bounds what interpolation was wrong by on the grid
     before, so the picture's root mean square error stays well below it; single pixels at an edge may be farther off. `tile`: a

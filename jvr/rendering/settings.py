@@ -18,7 +18,7 @@ class Settings(eqx.Module):
     - `termination`: a ray ends once its transmittance is at most this, in every channel. What is behind could have added at most
       `termination` times the brightest radiance. 0 follows every ray to its end.
     - `quadrature`: how a segment is integrated: `jvr.Midpoint()` (default) or `jvr.PreIntegrated()`.
-    - `skipping`: whether rays leap over bricks of the volume that the transfer function leaves empty. The picture is the same to
+    - `skipping`: whether rays skip bricks of the volume that the transfer function leaves empty. The picture is the same to
       rounding; what gradients skip is what has none.
     - `negligible`: optical depth of what a ray may leave out on top of that, in pictures, gradients and fits: bricks whose extinction is so
       small that a whole ray through the volume would gather less. A pixel changes by at most this times the brightest radiance, and

@@ -1,4 +1,4 @@
-"""The rays of a picture: from the camera into the volume, through it, and what they have gathered as colours."""
+"""Camera rays: from the camera into the volume, through it, and what they have gathered as colours."""
 
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, larger, one_minus_exp, ray_box, smaller
-from jvr.rendering.medium import medium, natural, occupancy, visibility
+from jvr.rendering.medium import environment, medium, occupancy, visibility
 from jvr.rendering.settings import Settings
 from jvr.types import Scalar, Triple
 
@@ -23,24 +23,24 @@ from jvr.types import Scalar, Triple
 FAR = 2.0
 
 
-class Seen(NamedTuple):
-    """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under light from
-    all around; each `None` where the scene asks for none."""
+class Prepared(NamedTuple):
+    """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under
+    environment lighting; each `None` where the scene asks for none."""
 
     occupancy: Occupancy | None = None
     shadows: AbstractVisibility | None = None
-    natural: Any = None
+    environment: Any = None
 
     @property
     def shadow_stats(self) -> Any:
         return None if self.shadows is None else self.shadows.stats
 
 
-def seen(scene: Scene, settings: Settings) -> Seen:
-    """What rays through a scene need to know beforehand."""
+def prepare(scene: Scene, settings: Settings) -> Prepared:
+    """What rays through a scene need to know beforehand, computed once."""
     (scene,) = near_volume(scene)
-    where = occupancy(scene, settings)
-    return Seen(where, visibility(scene, where), natural(scene))
+    occupied = occupancy(scene, settings)
+    return Prepared(occupied, visibility(scene, occupied), environment(scene))
 
 
 def trace(
@@ -49,16 +49,16 @@ def trace(
     settings: Settings,
     pixels: Int[Array, "rays"],
     *,
-    where: Seen = Seen(),
+    prepared: Prepared = Prepared(),
     distance: bool = False,
 ) -> tuple[Marched, Rays, Float[Array, "rays"]]:
-    """Marches the rays of some pixels, only `where` there is something to see; returns what they gathered, the rays, and the distance
-    from the eye to their entry."""
-    aimed, t_in = aim(scene, camera, settings, pixels, where)
-    return settings.adjoint.march(MarchOptions(settings.termination, distance), *aimed), aimed.rays, t_in
+    """Marches the rays of some pixels, only where `prepared` leaves something to see; returns what they gathered, the rays, and the
+    distance from the eye to their entry."""
+    of_camera, t_in = camera_rays(scene, camera, settings, pixels, prepared)
+    return settings.adjoint.march(MarchOptions(settings.termination, distance), *of_camera), of_camera.rays, t_in
 
 
-class Aimed(NamedTuple):
+class CameraRays(NamedTuple):
     """What a march takes: what rays go through, the rays, and the length of a segment."""
 
     medium: Medium
@@ -66,16 +66,16 @@ class Aimed(NamedTuple):
     dt: Scalar
 
 
-def aim(
-    scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], where: Seen
-) -> tuple[Aimed, Float[Array, "rays"]]:
+def camera_rays(
+    scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], prepared: Prepared
+) -> tuple[CameraRays, Float[Array, "rays"]]:
     """The rays of some pixels before they are marched, and the distance from the eye to their entry."""
     scene, camera = near_volume(scene, camera)
     rays, t_in = enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)))
-    return Aimed(medium(scene, settings, *where), rays, step_length(scene, settings)), t_in
+    return CameraRays(medium(scene, settings, *prepared), rays, step_length(scene, settings)), t_in
 
 
-def one_precision(scene: Scene, *others: Any) -> Any:
+def promote_dtypes(scene: Scene, *others: Any) -> Any:
     """A scene and whatever else with every floating-point array in the widest precision among them, as the state of the loop needs; with
     x64 on, parts of a scene may differ. Voxels stay as they are in memory."""
     voxels = lambda tree: tree[0].volume.values
@@ -88,7 +88,7 @@ def one_precision(scene: Scene, *others: Any) -> Any:
 def near_volume(scene: Scene, *others: Any) -> Any:
     """A scene and cameras in one precision and in a world whose origin is voxel (0, 0, 0), wherever that lies in theirs: differences of
     positions are taken before they are rounded. Derivatives are those in the world of the scene."""
-    scene, *cameras = one_precision(scene, *others)
+    scene, *cameras = promote_dtypes(scene, *others)
     origin = jax.lax.stop_gradient(scene.volume.origin)
     placed = lambda s: (s.volume, s.clipping, s.lights)
     lights = tuple(light.moved(origin) if isinstance(light, AbstractLight) else light for light in scene.lights)
@@ -157,7 +157,7 @@ class Pixels(NamedTuple):
     depth: Float[Array, "rays"]
 
 
-def develop(scene: Scene, gathered: Marched, rays: Rays, t_in: Float[Array, "rays"]) -> Pixels:
+def resolve(scene: Scene, gathered: Marched, rays: Rays, t_in: Float[Array, "rays"]) -> Pixels:
     """The pixels of rays that were marched with their distance."""
     rgb, alpha = composite(scene, gathered, rays.length)
     weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)

@@ -1,4 +1,4 @@
-"""The cheapest settings that a scene needs for a wanted accuracy, or the most accurate ones for a wanted time."""
+"""Tuning: the cheapest settings that a scene needs for a wanted accuracy, or the most accurate ones for a wanted time."""
 
 import dataclasses
 from typing import Any
@@ -12,7 +12,7 @@ from jvr.rendering.settings import Settings
 
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
 # Rays that end here can change no pixel by more than a tenth of the error that is asked for, times the brightest radiance.
-TERMINATION_SHARE = 0.1
+TERMINATION_FRACTION = 0.1
 # Pictures for the prediction are this much smaller on each side.
 SMALLER = 2
 # Choices that are measured on the whole picture before the safest one is.
@@ -21,8 +21,9 @@ MOST_TRIES = 3
 
 @dataclasses.dataclass(frozen=True)
 class Tuned:
-    """`settings`: those chosen; `predicted`: error and seconds as a smaller picture foretold them; `measured`: of the whole picture;
-    `met`: whether what was asked for holds in the measurement; `candidates`: what was measured on the smaller picture."""
+    """What `jvr.tune` found. `settings`: those chosen; `predicted`: error and seconds as a smaller picture foretold them; `measured`: of
+    the whole picture; `met`: whether what was asked for holds in the measurement; `candidates`: what was measured on the smaller
+    picture."""
 
     settings: Settings
     predicted: Measurement
@@ -61,7 +62,7 @@ def _whole(scene: Scene, camera: AbstractCamera, predicted: Measurement) -> Meas
 
 
 def _candidates(scene: Scene, error: float | None) -> list[Settings]:
-    termination = 1e-3 if error is None else min(TERMINATION_SHARE * error, 0.1)
+    termination = 1e-3 if error is None else min(TERMINATION_FRACTION * error, 0.1)
     integrable = isinstance(scene.transfer, LinearTransfer | LutTransfer)
     quadratures: list[Any] = [Midpoint(), PreIntegrated()] if integrable else [Midpoint()]
     return [Settings(step, termination=termination, quadrature=q) for q in quadratures for step in STEPS]

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jvr.io.config.cameras import cameras_of
+from jvr.io.config.environment import Precompute, environment_parts, fit_scene, keeps_radiance_transfer, precomputed
 from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.light import graded, light_parts
 from jvr.io.config.load import Config, started
-from jvr.io.config.natural import Prepare, fit_scene, keeps_transfer, natural_parts, precomputed
 from jvr.io.config.schema.transfer import AnyTransfer, TransferFile
 from jvr.io.config.schema.whole import AnySampling, FitTable, RefinementTable, SlicesTable, VolumeTable
 from jvr.io.config.transfers import build_transfer, read_transfer, with_gradient
@@ -46,7 +46,7 @@ class FitJob(NamedTuple):
     - `truth`: the transfer function that rendered the targets, `None` where they are files.
     - `held_out`: cameras and images that take no part, `None` without any.
     - `keywords`: of `jvr.fit`: unknowns, solver, loss, priors and so on.
-    - `keeps_transfer`: whether the radiance transfer stays that of the start though the unknowns change it.
+    - `keeps_radiance_transfer`: whether the radiance transfer stays that of the start though the unknowns change it.
     """
 
     scene: Scene
@@ -55,7 +55,7 @@ class FitJob(NamedTuple):
     truth: AbstractTransfer | None
     held_out: tuple[tuple[AbstractCamera, ...], tuple[np.ndarray, ...]] | None
     keywords: dict[str, Any]
-    keeps_transfer: bool = False
+    keeps_radiance_transfer: bool = False
 
 
 def build_settings(config: Config) -> Settings:
@@ -123,10 +123,12 @@ def build_cameras(config: Config, volume: Volume, transfer: AbstractTransfer | N
     return tuple(cameras)
 
 
-def build_fit(config: Config, read_image: Callable[..., np.ndarray] | None = None, prepare: Prepare = precomputed) -> FitJob:
+def build_fit(
+    config: Config, read_image: Callable[..., np.ndarray] | None = None, precompute: Precompute = precomputed
+) -> FitJob:
     """Everything that `jvr.fit` needs; renders the targets of a synthetic experiment.
 
-    `prepare`: `jvr.precompute`, or something that takes its keywords.
+    `precompute`: `jvr.precompute`, or something that takes its keywords.
 
     **Raises** `ConfigError` where there is no `[fit]`, or something in it does not go together.
     """
@@ -137,18 +139,18 @@ def build_fit(config: Config, read_image: Callable[..., np.ndarray] | None = Non
     cameras = build_cameras(config, volume)
     scene = _scene(started(config), volume, _start_transfer(config, fit, volume))
     keywords = {**_keywords(config, fit), "unknowns": _unknowns(config, fit, scene), "settings": settings}
-    scene = fit_scene(config, scene, prepare)
+    scene = fit_scene(config, scene, precompute)
     if tables.truth is None:
         images = _images(config, fit, cameras, read_image)
         (inside, targets), held_out = _held_out_images(config, fit, cameras, images)
-        return FitJob(scene, inside, targets, None, held_out, keywords, keeps_transfer(config))
+        return FitJob(scene, inside, targets, None, held_out, keywords, keeps_radiance_transfer(config))
     truth = _transfer(config, tables.truth, volume, "truth")
-    true_scene = prepare(_scene(config, volume, truth))
+    true_scene = precompute(_scene(config, volume, truth))
     picture = lambda camera: np.asarray(render(true_scene, camera, settings).rgb)
     extra = _extra_cameras(config, fit, cameras, volume)
     inside, outside = ([c for c, out in extra if out == which] for which in (False, True))
     held_out = (tuple(outside), tuple(map(picture, outside))) if outside else None
-    return FitJob(scene, tuple(inside), tuple(map(picture, inside)), truth, held_out, keywords, keeps_transfer(config))
+    return FitJob(scene, tuple(inside), tuple(map(picture, inside)), truth, held_out, keywords, keeps_radiance_transfer(config))
 
 
 def _sampling(table: AnySampling) -> AbstractSampling:
@@ -180,7 +182,7 @@ def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
     if tables.clipping is not None:
         with blame(config.where("clipping"), "clipping"):
             clipping = ClippingBox(tables.clipping.lower, tables.clipping.upper)
-    light = light_parts(config, transfer) | natural_parts(config)
+    light = light_parts(config, transfer) | environment_parts(config)
     fitted = () if tables.fit is None else tables.fit.unknowns
     if not any(name.startswith("volume.") for name in fitted):
         volume = graded(volume, light, transfer)

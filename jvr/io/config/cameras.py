@@ -119,14 +119,14 @@ def _pose(table: PerspectiveTable | OrthographicTable, center: np.ndarray) -> tu
     return right, np.cross(back, right), back
 
 
-def _rig(table: RigTable, center: np.ndarray, reach: float) -> tuple[PerspectiveCamera, ...]:
+def _rig(table: RigTable, center: np.ndarray, extent: float) -> tuple[PerspectiveCamera, ...]:
     if table.half_angle_tangent is not None:
         fov_y = 2 * np.degrees(np.arctan(table.half_angle_tangent))
     else:
         fov_y = 30.0 if table.fov_y is None else table.fov_y
     aspect = min(1.0, table.width / table.height)
     half = np.arctan(np.tan(np.radians(fov_y / 2)) * aspect)
-    radius = reach / np.sin(half) if table.radius is None else table.radius
+    radius = extent / np.sin(half) if table.radius is None else table.radius
     if table.kind == "fibonacci":
         return fibonacci_sphere(center, radius, table.count, fov_y, table.width, table.height)
     axis = (0.0, 0.0, 1.0) if table.axis is None else table.axis

@@ -78,7 +78,7 @@ def grid_numbers(path: str | os.PathLike, name: str, text: str | Sequence[str], 
 
 
 def grid_shape(path: str | os.PathLike, name: str, words: Sequence[str]) -> tuple[int, ...]:
-    """A shape in voxels as a header announces it: positive whole numbers."""
+    """A shape in voxels as a header announces it: positive integers."""
     try:
         shape = tuple(int(word) for word in words)
     except ValueError:

@@ -66,7 +66,7 @@ def _shape(path: Path, fields: Fields) -> tuple[int, ...]:
 
 
 def _whole(path: Path, fields: Fields, name: str) -> int:
-    """A whole number of a header, 0 where it is absent."""
+    """An integer of a header, 0 where it is absent."""
     text = fields.get(name, "0")
     if not re.fullmatch(r"[+-]?\d{1,18}", text, re.ASCII):
         raise VolumeError(path, f"{name} is '{text[:40]}'; it must be a whole number")

@@ -79,16 +79,16 @@ def triple_product(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> Float[Array, "*r
 
 
 def two_double_products(material: ArrayLike, light: ArrayLike, transfer: ArrayLike) -> Float[Array, "*rest"]:
-    """The paper's shortcut for the integral of material, light and transfer: `(material . light) (transfer . light)` (Lindemann and
-    Ropinski 2010, section 4.3), divided by the integral of the light, so that a transfer of one leaves the light as it is.
+    """The paper's shortcut for the integral of material, light and radiance transfer: `(material . light) (transfer . light)` (Lindemann
+    and Ropinski 2010, section 4.3), divided by the integral of the light, so that a radiance transfer of one leaves the light as it is.
 
-    Exact where the transfer is the same from everywhere. Zero without light.
+    Exact where the radiance transfer is the same from everywhere. Zero without light.
     """
     material, light, transfer = as_floats(material), as_floats(light), as_floats(transfer)
     total = light[0] * np.sqrt(4 * np.pi)
     there = total != 0
-    share = jnp.sum(transfer * light, axis=0) / jnp.where(there, total, 1.0)
-    return jnp.where(there, jnp.sum(material * light, axis=0) * share, 0.0)
+    fraction = jnp.sum(transfer * light, axis=0) / jnp.where(there, total, 1.0)
+    return jnp.where(there, jnp.sum(material * light, axis=0) * fraction, 0.0)
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from jvr.types import ArrayLike, Triple
 
 
 def count(order: int) -> int:
-    """Coefficients up to an order: `(order + 1)^2`. **Raises** `ValueError` where it is not a whole number from 0 on."""
+    """Coefficients up to an order: `(order + 1)^2`. **Raises** `ValueError` where it is not an integer from 0 on."""
     if isinstance(order, bool) or not isinstance(order, int) or order < 0:
         raise ValueError(f"order must be a whole number of at least 0, not {order!r}; 3 is a good start")
     return (order + 1) ** 2

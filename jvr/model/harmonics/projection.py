@@ -137,8 +137,8 @@ def cap(gap: Float[Array, "..."], order: int) -> list[Array]:
         value.append(((2 * n + 1) * z * value[n] - n * value[n - 1]) / (n + 1))
         slope.append(slope[n - 1] + (2 * n + 1) * value[n])
     edge = gap * (2 - gap)
-    shares = [gap, *(edge * slope[n] / (n * (n + 1)) for n in range(1, order + 1))]
-    return [math.sqrt(math.pi * (2 * n + 1)) * share for n, share in enumerate(shares)]
+    fractions = [gap, *(edge * slope[n] / (n * (n + 1)) for n in range(1, order + 1))]
+    return [math.sqrt(math.pi * (2 * n + 1)) * fraction for n, fraction in enumerate(fractions)]
 
 
 def convolve(coefficients: ArrayLike, kernel: ArrayLike) -> Float[Array, "bands *rest"]:

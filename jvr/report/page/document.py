@@ -14,7 +14,7 @@ import numpy as np
 from jvr.atomic import replacing
 from jvr.model.transfer import AbstractTransfer
 from jvr.report.errors import field_errors
-from jvr.report.page.summary import determination, summary, verdict
+from jvr.report.page.summary import identifiability, summary, verdict
 from jvr.report.page.values import other_values, transfer_values
 from jvr.report.plots import comparison_strip, plot_convergence, plot_transfer, png
 from jvr.report.plots.pictures import MOST_VIEWS, check_pairs
@@ -91,7 +91,7 @@ def write_fit_page(
         *([] if transfer.takes_gradient else [_transfer(transfer, errors, truth, histogram, _reached_by_light(transfer))]),
         *([] if transfer.takes_gradient else [transfer_values(transfer, errors)]),
         other_values(result.scene, result.errors_by_name),
-        determination(result, transfer),
+        identifiability(result, transfer),
         _convergence(result),
         _again(command, config_text, versions),
     ]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jvr.model.transfer import AbstractTransfer
-from jvr.report.page.words import counted, duration, memory, worst_in_words
+from jvr.report.page.words import counted, duration, least_determined_in_words, memory
 from jvr.report.plots.pictures import decibels
 from jvr.types import Outcome
 
@@ -81,7 +81,7 @@ def _all_decibels(targets: Sequence[Any], fitted: Sequence[Any]) -> str:
     return decibels(flat(targets), flat(fitted))
 
 
-def determination(result: "FitResult", transfer: AbstractTransfer) -> str:
+def identifiability(result: "FitResult", transfer: AbstractTransfer) -> str:
     stats, count = result.stats, _unknown_count(result)
     missing = count - stats.rank
     if missing > 0:
@@ -92,7 +92,7 @@ def determination(result: "FitResult", transfer: AbstractTransfer) -> str:
         rank = f"The images determine all {count} unknowns, the best combination {ratio} times as sharply as the worst."
     parts = [f"<h2>What the images tell least about</h2><p>{rank}</p>"]
     if stats.worst:
-        parts.append(f"<p>{escape(worst_in_words(stats.worst, transfer))}</p>")
+        parts.append(f"<p>{escape(least_determined_in_words(stats.worst, transfer))}</p>")
         share = "; ".join(f"{name} {coefficient:+.2f}" for name, coefficient in stats.worst)
         parts.append(f'<p class="soft">Largest coefficients, each unknown in units of its own sensitivity: {escape(share)}.</p>')
     return "".join(parts)

@@ -49,8 +49,8 @@ def entries_in_words(indices: np.ndarray, transfer: AbstractTransfer) -> str:
     return f"{noun[len(indices) > 1]} {text}"
 
 
-def worst_in_words(worst: Sequence[tuple[str, float]], transfer: AbstractTransfer) -> str:
-    """The worst-determined combination as a sentence: what one can raise and lower together without changing the pictures."""
+def least_determined_in_words(worst: Sequence[tuple[str, float]], transfer: AbstractTransfer) -> str:
+    """The least-determined direction as a sentence: what one can raise and lower together without changing the pictures."""
     raised = _unknowns_in_words([name for name, coefficient in worst if coefficient > 0], transfer)
     lowered = _unknowns_in_words([name for name, coefficient in worst if coefficient < 0], transfer)
     if not lowered and not raised:

@@ -1,4 +1,4 @@
-"""The way of a fit: objective and PSNR after each iteration."""
+"""Convergence of a fit: objective and PSNR after each iteration."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING

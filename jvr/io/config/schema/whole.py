@@ -6,8 +6,8 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
+from jvr.io.config.schema.environment import Environments, Material, RadianceTransferTable
 from jvr.io.config.schema.light import Lights, Normals, ScatteringTable, Shading, Shadows, casts_shadows
-from jvr.io.config.schema.natural import Environments, Material, RadianceTransferTable
 from jvr.io.config.schema.table import Angle, Colour, Extinction, Length, Pixels, Position, Range, Scalar, Table, named
 from jvr.io.config.schema.transfer import TransferTable
 
@@ -257,10 +257,10 @@ class ConfigTable(Table):
             raise problem('nothing shows it; add [material], such as kind = "lambert"', "environment")
         if self.material is not None and not self.environment:
             raise problem(
-                'it shows light from all around; add [environment] with kind = "image", "constant" or "disc"', "material"
+                'it shows environment lighting; add [environment] with kind = "image", "constant" or "disc"', "material"
             )
         if self.radiance_transfer is not None and not self.environment:
-            raise problem("it is that of light from all around; add [environment] and [material]", "radiance_transfer")
+            raise problem("it is that of environment lighting; add [environment] and [material]", "radiance_transfer")
         if fit is None and self.transfer is None and self.truth is None:
             raise problem('missing; add a table such as [transfer] kind = "window"', "transfer")
         if fit is None:

@@ -57,7 +57,7 @@ def _series(folder: Path, pictures: list[Header], given: Given, notes: list[str]
     series: dict[str, list[Header]] = {}
     for picture in pictures:
         series.setdefault(picture.text("SeriesInstanceUID"), []).append(picture)
-    shown = ", ".join(f"'{name}' ({_described(found)})" for name, found in list(series.items())[:8])
+    shown = ", ".join(f"'{name}' ({_contents(found)})" for name, found in list(series.items())[:8])
     shown += f" and {len(series) - 8} more" if len(series) > 8 else ""
     if given.series is not None:
         if given.series not in series:
@@ -72,7 +72,7 @@ def _series(folder: Path, pictures: list[Header], given: Given, notes: list[str]
     return series[volumes[0]]
 
 
-def _described(found: list[Header]) -> str:
+def _contents(found: list[Header]) -> str:
     count = f"{len(found)} slice{'s' if len(found) > 1 else ''}"
     words = (found[0].text("Modality"), found[0].text("SeriesDescription")[:40], count)
     return ", ".join(word for word in words if word)

@@ -95,14 +95,14 @@ class _Groups:
 def frames_of(header: Header, given: Given, notes: list[str]) -> list[Frame]:
     """All frames of an object, checked against the bytes that the file has for them."""
     dataset = header.dataset
-    rows, columns = header.whole("Rows"), header.whole("Columns")
-    count = header.whole("NumberOfFrames", 1) if dataset.get("NumberOfFrames") is not None else 1
+    rows, columns = header.integer("Rows"), header.integer("Columns")
+    count = header.integer("NumberOfFrames", 1) if dataset.get("NumberOfFrames") is not None else 1
     if min(rows, columns, count) < 1:
         raise VolumeError(header.file, f"it announces {columns} x {rows} pixels and {count} frames: the file is damaged")
-    if (samples := header.whole("SamplesPerPixel", 1)) != 1:
+    if (samples := header.integer("SamplesPerPixel", 1)) != 1:
         raise VolumeError(header.file, f"its pictures are in colour ({samples} samples a pixel); save them as grey ones")
     _refuse_tiles(header, rows, columns, count)
-    bits = header.whole("BitsAllocated", 16)
+    bits = header.integer("BitsAllocated", 16)
     compressed = header.syntax.startswith("1.2.840.10008.1.2.4") or header.syntax in RATIO_UNKNOWN
     stored = max(header.bytes_stored, HARMLESS // 1100) if compressed else header.bytes_stored
     check_size(header.file, (columns, -(-rows * bits // 8), count), 1, stored, compressed=compressed)
@@ -128,7 +128,7 @@ def _refuse_tiles(header: Header, rows: int, columns: int, count: int) -> None:
     if count == 1 and "MOSAIC" in [str(word).upper() for word in header.dataset.get("ImageType") or []]:
         problem = "its picture is a mosaic of all slices (ImageType MOSAIC)"
         raise VolumeError(header.file, f"{problem}: split it, as `dcm2niix` does, and read the NIfTI file")
-    whole = [header.whole(f"TotalPixelMatrix{name}", 0) for name in ("Columns", "Rows")]
+    whole = [header.integer(f"TotalPixelMatrix{name}", 0) for name in ("Columns", "Rows")]
     if whole[0] > columns or whole[1] > rows:
         problem = f"its frames are tiles of one slide of {whole[0]} x {whole[1]} pixels, not slices of a volume"
         raise VolumeError(header.file, f"{problem}: export the slide as one picture")
@@ -153,7 +153,7 @@ def _frame(header: Header, groups: _Groups, k: int, size: tuple[int, int], given
     if (scaling := header.dataset.get("DoseGridScaling")) is not None:
         slope = number("DoseGridScaling", scaling, given.slope is not None)
     if str(header.dataset.get("SegmentationType", "")).upper() == "FRACTIONAL":
-        slope = 1 / max(header.whole("MaximumFractionalValue", 1), 1)
+        slope = 1 / max(header.integer("MaximumFractionalValue", 1), 1)
     intercept = number("RescaleIntercept", transform("RescaleIntercept"), given.intercept is not None)
     if slope == 0 and given.slope is None:
         raise VolumeError(header.file, "its rescale slope is 0, which makes all values equal: correct it, or give slope=")

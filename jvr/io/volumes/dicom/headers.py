@@ -61,7 +61,7 @@ class Header:
         wanted = f"{count} {'positive ' if positive else ''}finite number{'s' if count > 1 else ''}"
         raise VolumeError(self.file, f"{name} is '{str(value)[:60]}'; it must be {wanted}: correct it, or give {_keyword(name)}")
 
-    def whole(self, name: str, default: int | None = None) -> int:
+    def integer(self, name: str, default: int | None = None) -> int:
         value = self.numbers(name, self.dataset.get(name, default), 1)
         if value is None or value[0] != int(value[0]) or value[0] < 0:
             raise VolumeError(self.file, f"{name} is '{self.text(name)}'; it must be a whole number: the file is damaged")

@@ -114,17 +114,17 @@ def _type(header: Header) -> np.dtype:
     """The type of stored values."""
     if header.dataset.get("BitsAllocated") == 1:
         return np.dtype(np.uint8)
-    bits = header.whole("BitsAllocated")
+    bits = header.integer("BitsAllocated")
     if bits not in (8, 16, 32, 64):
         raise VolumeError(header.file, f"BitsAllocated is {bits}; 1, 8, 16, 32 or 64 would be right: export it again")
     if header.is_float:
         if bits < 32:
             raise VolumeError(header.file, f"BitsAllocated is {bits} for floating-point pixels; 32 or 64 would be right")
         return np.dtype(f"f{bits // 8}")
-    stored, high = header.whole("BitsStored", bits), header.whole("HighBit", header.whole("BitsStored", bits) - 1)
+    stored, high = header.integer("BitsStored", bits), header.integer("HighBit", header.integer("BitsStored", bits) - 1)
     if not 1 <= stored <= high + 1 <= bits:
         raise VolumeError(header.file, f"BitsStored {stored} and HighBit {high} do not fit {bits} bits: its header is wrong")
-    return np.dtype(f"{'i' if header.whole('PixelRepresentation', 0) == 1 else 'u'}{bits // 8}")
+    return np.dtype(f"{'i' if header.integer('PixelRepresentation', 0) == 1 else 'u'}{bits // 8}")
 
 
 def _interpreted(header: Header, pixels: np.ndarray, dtype: np.dtype, notes: list[str]) -> np.ndarray:
@@ -132,8 +132,8 @@ def _interpreted(header: Header, pixels: np.ndarray, dtype: np.dtype, notes: lis
     if pixels.dtype.kind == "f" or header.dataset.get("BitsAllocated") == 1:
         return pixels
     bits = 8 * dtype.itemsize
-    stored = header.whole("BitsStored", bits)
-    high = header.whole("HighBit", stored - 1)
+    stored = header.integer("BitsStored", bits)
+    high = header.integer("HighBit", stored - 1)
     up, down = bits - 1 - high, bits - stored
     if not down:
         return pixels.view(dtype)
@@ -196,13 +196,13 @@ def _frames(frames: list[Frame]) -> Iterator[tuple[Header, int, np.ndarray]]:
 
 
 def _frame_bytes(frame: Frame) -> int:
-    return frame.size[0] * frame.size[1] * max(frame.source.whole("BitsAllocated") // 8, 1)
+    return frame.size[0] * frame.size[1] * max(frame.source.integer("BitsAllocated") // 8, 1)
 
 
 def _native(header: Header, indices: list[int]) -> Iterator[tuple[Header, int, np.ndarray]]:
-    columns, rows = header.whole("Columns"), header.whole("Rows")
-    bits = header.whole("BitsAllocated")
-    count = header.whole("NumberOfFrames", 1) if header.dataset.get("NumberOfFrames") is not None else 1
+    columns, rows = header.integer("Columns"), header.integer("Rows")
+    bits = header.integer("BitsAllocated")
+    count = header.integer("NumberOfFrames", 1) if header.dataset.get("NumberOfFrames") is not None else 1
     wanted = -(-rows * columns * count * bits // 8)
     dataset = parsed(header.file, pixels=wanted)
     name = next((name for name in ("PixelData", "FloatPixelData", "DoubleFloatPixelData") if name in dataset), None)
@@ -251,7 +251,7 @@ def _streams(header: Header, indices: list[int]) -> list[tuple[int, bytes]]:
     if importlib.util.find_spec("imagecodecs") is None:
         raise VolumeError(header.file, f"{_syntax_name(header)} pixels need a decoder: pip install imagecodecs")
     dataset = parsed(header.file, pixels=0)
-    count = header.whole("NumberOfFrames", 1) if dataset.get("NumberOfFrames") is not None else 1
+    count = header.integer("NumberOfFrames", 1) if dataset.get("NumberOfFrames") is not None else 1
     offsets = [dataset.get(name) for name in ("ExtendedOffsetTable", "ExtendedOffsetTableLengths")]
     with guarded(header.file):
         extended: Any = tuple(offsets) if all(offsets) else None
@@ -275,7 +275,7 @@ def _decoded(waiting: list[tuple[Frame, bytes]]) -> Iterator[tuple[Header, int, 
             "bytes": len(stream),
             "rows": frame.size[1],
             "columns": frame.size[0],
-            "itemsize": max(frame.source.whole("BitsAllocated") // 8, 1),
+            "itemsize": max(frame.source.integer("BitsAllocated") // 8, 1),
         }
         for frame, stream in waiting
     ]

@@ -9,7 +9,7 @@ import numpy as np
 from jvr.io.config.errors import blame
 from jvr.io.config.light import phase_of
 from jvr.io.config.load import Config
-from jvr.io.config.schema.natural import (
+from jvr.io.config.schema.environment import (
     AnyEnvironment,
     AnyMaterial,
     DipoleTable,
@@ -24,11 +24,11 @@ from jvr.model.effects import AbstractMaterial
 from jvr.model.environment import EnvironmentLight
 from jvr.model.scene import Scene, material_order
 
-Prepare = Callable[..., Scene]
+Precompute = Callable[..., Scene]
 
 
-def natural_parts(config: Config) -> dict[str, Any]:
-    """What a configuration says about light from all around, as keywords of `jvr.Scene`."""
+def environment_parts(config: Config) -> dict[str, Any]:
+    """What a configuration says about environment lighting, as keywords of `jvr.Scene`."""
     tables, parts = config.tables, {}
     if tables.radiance_transfer is not None:
         with blame(config.where("radiance_transfer"), "radiance_transfer"):
@@ -45,7 +45,7 @@ def natural_parts(config: Config) -> dict[str, Any]:
 
 
 def precomputed(scene: Scene, **keywords: Any) -> Scene:
-    """`jvr.precompute`, which is imported for scenes alone that have light from all around."""
+    """`jvr.precompute`, which is imported for scenes alone that have environment lighting."""
     if scene.environment is None:
         return scene
     from jvr.io.precompute import precompute
@@ -53,24 +53,24 @@ def precomputed(scene: Scene, **keywords: Any) -> Scene:
     return precompute(scene, **keywords)
 
 
-def keeps_transfer(config: Config) -> bool:
+def keeps_radiance_transfer(config: Config) -> bool:
     """Whether a fit keeps the radiance transfer of its start though its unknowns change it."""
     table = config.tables.radiance_transfer
-    return table is not None and table.frozen and _fits(config, *_shapes_transfer(table))
+    return table is not None and table.frozen and _fits(config, *_shapes_radiance_transfer(table))
 
 
-def _shapes_transfer(table: RadianceTransferTable) -> tuple[str, ...]:
+def _shapes_radiance_transfer(table: RadianceTransferTable) -> tuple[str, ...]:
     """Parts of the scene that radiance transfer is computed from."""
     return ("transfer", "volume", "clipping", *(["material"] if table.bleeding == "material" else []))
 
 
-def fit_scene(config: Config, scene: Scene, prepare: Prepare) -> Scene:
+def fit_scene(config: Config, scene: Scene, precompute: Precompute) -> Scene:
     """The scene that a fit starts from, with all computed beforehand that the fit does not change, or keeps as it is at its start."""
     keep = {"keep_material": _fits(config, "material"), "keep_unscattered": _fits(config, "radiance_transfer")}
     transfer, table = scene.radiance_transfer, config.tables.radiance_transfer
-    if table is None or table.frozen or not _fits(config, *_shapes_transfer(table)):
-        return prepare(scene, **keep)
-    return dataclasses.replace(prepare(dataclasses.replace(scene, radiance_transfer=None), **keep), radiance_transfer=transfer)
+    if table is None or table.frozen or not _fits(config, *_shapes_radiance_transfer(table)):
+        return precompute(scene, **keep)
+    return dataclasses.replace(precompute(dataclasses.replace(scene, radiance_transfer=None), **keep), radiance_transfer=transfer)
 
 
 def _fits(config: Config, *parts: str) -> bool:

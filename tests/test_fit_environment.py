@@ -1,4 +1,4 @@
-"""Light from all around, materials, dipoles and the transfer function under them are recovered from pictures."""
+"""Environment lighting, materials, dipoles and the transfer function under them are recovered from pictures."""
 
 import dataclasses
 
@@ -10,9 +10,9 @@ import pytest
 from scenes import compiled
 
 import jvr
-from jvr.fitting.objective import Problem, has_rows, march_unknowns, normal_equations, prepared, value
+from jvr.fitting.objective import Problem, has_table_jacobian, light_tangents, march_unknowns, normal_equations, value
 from jvr.fitting.observations import observe
-from jvr.fitting.unknowns import Exposed, choose_unknowns
+from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 
 SETTINGS = jvr.Settings(1.5)
 TRANSFER = jvr.RadianceTransfer(order=1, rays=12, resolution=0.4, step=2.0, growth=1.5)
@@ -55,7 +55,7 @@ def fit(start, cameras, images, unknowns, **keywords):
 
 def problem_of(one, unknowns):
     """A fit's problem, with the values at which it starts."""
-    model = Exposed(one, None)
+    model = ExposedModel(one, None)
     chosen = choose_unknowns(model, lambda m: unknowns(m.scene))
     problem = Problem(model, chosen, SETTINGS, jvr.SquaredError(), (), None)
     return problem, jnp.concatenate([jnp.ravel(x) for x in chosen.values(model)])
@@ -112,13 +112,13 @@ def test_what_a_fit_takes_for_an_unknown(volume):
         (lambda s: s.environment.coefficients): (-np.inf, np.inf),
     }
     for select, (low, high) in bounds.items():
-        (transform,) = choose_unknowns(Exposed(one, None), lambda m, select=select: select(m.scene)).transforms
+        (bijector,) = choose_unknowns(ExposedModel(one, None), lambda m, select=select: select(m.scene)).bijectors
         far = np.array([-40.0, 40.0])
-        ends = [low if np.isfinite(low) else -40.0, high if np.isfinite(high) else float(transform.forward(jnp.asarray(40.0)))]
+        ends = [low if np.isfinite(low) else -40.0, high if np.isfinite(high) else float(bijector.forward(jnp.asarray(40.0)))]
         # What is positive stays a millionth of its typical size, here of 5, above zero.
-        np.testing.assert_allclose(jax.vmap(transform.forward)(jnp.asarray(far)), ends, atol=1e-5)
+        np.testing.assert_allclose(jax.vmap(bijector.forward)(jnp.asarray(far)), ends, atol=1e-5)
         start = select(one)
-        np.testing.assert_allclose(transform.forward(transform.inverse(start)), start, rtol=1e-5, atol=2e-3)
+        np.testing.assert_allclose(bijector.forward(bijector.inverse(start)), start, rtol=1e-5, atol=2e-3)
 
 
 def test_colours_of_light_share_a_march(volume):
@@ -129,9 +129,9 @@ def test_colours_of_light_share_a_march(volume):
 def test_entries_act_through_a_transfer_that_is_not_frozen(volume, frozen):
     recomputed = scene(volume, radiance_transfer=TRANSFER)
     unknowns = lambda s: s.transfer.sigma_t
-    assert not has_rows(recomputed)
+    assert not has_table_jacobian(recomputed)
     assert march_unknowns(problem_of(recomputed, unknowns)[0]) == 3
-    assert has_rows(frozen)
+    assert has_table_jacobian(frozen)
     assert march_unknowns(problem_of(frozen, unknowns)[0]) == 0
 
 
@@ -166,12 +166,12 @@ def both_ways(one, unknowns):
     cameras, images = views(scene(one.volume, sigma=0.3))
     observations = observe(one, cameras, images, None, SETTINGS).dealt(128)
     total = jnp.asarray(3.0 * observations.size)
-    around = prepared(problem, values)
-    vectors = [normal_equations(problem, values, piece, around).vector for piece in observations.pieces(128)]
-    # On the real line every value is itself.
-    identity = eqx.tree_at(lambda p: p.unknowns.transforms, problem, tuple(jvr.Identity() for _ in problem.unknowns.transforms))
-    pieces = jax.tree.map(lambda x: x.reshape(-1, 128, *x.shape[1:]), observations)
-    gradient = compiled(jax.grad(lambda v: value(identity, v, pieces, total)))(values)
+    around = light_tangents(problem, values)
+    vectors = [normal_equations(problem, values, tile, around).vector for tile in observations.tiles(128)]
+    # In unconstrained space every value is itself.
+    identity = eqx.tree_at(lambda p: p.unknowns.bijectors, problem, tuple(jvr.Identity() for _ in problem.unknowns.bijectors))
+    tiles = jax.tree.map(lambda x: x.reshape(-1, 128, *x.shape[1:]), observations)
+    gradient = compiled(jax.grad(lambda v: value(identity, v, tiles, total)))(values)
     return 2 * sum(np.asarray(v, np.float64) for v in vectors) / float(total), gradient
 
 

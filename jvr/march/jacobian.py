@@ -1,4 +1,4 @@
-"""Derivatives of every ray with respect to every entry of a tabulated transfer function, out of one replay.
+"""The per-ray Jacobian with respect to the entries of a tabulated transfer function, out of one replay.
 
 Entry `p` has weight `hat_p(s) = max(0, 1 - |coordinate(s) - p|)` in a sample, so
 
@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.adjoint import BackLanes, Behind, segment_cotangents, step_back
-from jvr.march.batch import pooled_while
+from jvr.march.adjoint import BackwardRays, SuffixRadiance, segment_cotangents, step_back
 from jvr.march.march import Marched, MarchOptions, integrate
 from jvr.march.medium import Medium, for_derivatives
-from jvr.march.segments import Stretch, lanes_of, light_at, shown
+from jvr.march.segments import SegmentBatch, active_rays, light_at, occupied_count
 from jvr.march.shaders import where_known
-from jvr.march.steps import Rays, points_at, segment
+from jvr.march.steps import Rays, points_at, segment_span
 from jvr.march.sums import transmittance
+from jvr.march.wavefront import wavefront_while
 from jvr.model.transfer import AbstractTable, Classified
 from jvr.types import Channels, Scalar
 
@@ -32,8 +32,8 @@ from jvr.types import Channels, Scalar
 BLOCK = 8
 
 
-class TableRows(NamedTuple):
-    """Rows of the Jacobian of a march. Each is `(rays, entries)`, for one channel of radiance or optical depth.
+class TableJacobian(NamedTuple):
+    """The per-ray Jacobian of a march, by rows. Each is `(rays, entries)`, for one channel of radiance or optical depth.
 
     `radiance_rgb[c]`, `radiance_sigma[c]`: of radiance channel `c` with respect to column `c` of the colours, and to the extinctions
     (column `c` of them where they are coloured); `tau_sigma[c]`: of optical depth `c` with respect to the extinctions. Those of
@@ -45,69 +45,71 @@ class TableRows(NamedTuple):
     tau_sigma: tuple[Float[Array, "rays n"], ...]
 
 
-class _RowState(NamedTuple):
-    behind: Behind
+class _JacobianState(NamedTuple):
+    suffix: SuffixRadiance
     j: Int[Array, "rays"]
-    rows: TableRows
+    rows: TableJacobian
 
 
-def table_rows(
+def table_jacobian(
     options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar, *, of_extinctions: bool = True
-) -> tuple[Marched, TableRows]:
+) -> tuple[Marched, TableJacobian]:
     """The march of `jvr.march.march.march` and its rows with respect to the entries of `medium.transfer`, an `AbstractTable`: colours and,
     unless not `of_extinctions`, extinctions.
 
-    Distances have no rows. Memory: `rays x entries` numbers for each row that `TableRows` lists. Detached as in `march`.
+    Distances have no rows. Memory: `rays x entries` numbers for each row that `TableJacobian` lists. Detached as in `march`.
     """
-    gathered, noted = integrate(options, medium, rays, dt, for_replay=True)
+    gathered, record = integrate(options, medium, rays, dt, for_replay=True)
     assert isinstance(medium.transfer, AbstractTable)
-    assert noted is not None
+    assert record is not None
     wanted = jax.tree.map(lambda _: None, medium)
     of_entries = (lambda m: (m.transfer.rgb, m.transfer.sigma_t)) if of_extinctions else lambda m: m.transfer.rgb
     medium = for_derivatives(medium, eqx.tree_at(of_entries, wanted, of_entries(medium), is_leaf=lambda x: x is None))
     n = medium.transfer.rgb.shape[0]
-    emits, absorbs = len(gathered.radiance), len(noted.front)
+    emits, absorbs = len(gathered.radiance), len(record.front)
 
-    def start(back: BackLanes) -> _RowState:
+    def start(back: BackwardRays) -> _JacobianState:
         zero = jnp.zeros((back.steps.size, n), rays.length.dtype)
-        rows = TableRows((zero,) * emits, (zero,) * emits * of_extinctions, (zero,) * absorbs * of_extinctions)
-        return _RowState(back.nothing_behind(emits, distance=False), jnp.zeros_like(back.steps), rows)
+        rows = TableJacobian((zero,) * emits, (zero,) * emits * of_extinctions, (zero,) * absorbs * of_extinctions)
+        return _JacobianState(back.empty_suffix(emits, distance=False), jnp.zeros_like(back.steps), rows)
 
-    def alive(back: BackLanes, state: _RowState):
+    def alive(back: BackwardRays, state: _JacobianState):
         return state.j < back.steps
 
-    def advance(back: BackLanes, state: _RowState, _: None) -> tuple[_RowState, None]:
-        one = lambda carry, _: _row_segment(medium, dt, back, of_extinctions, *carry)
-        (behind, j), (u, weights) = jax.lax.scan(one, (state.behind, state.j), length=BLOCK)
+    def advance(back: BackwardRays, state: _JacobianState, _: None) -> tuple[_JacobianState, None]:
+        one = lambda carry, _: _jacobian_segment(medium, dt, back, of_extinctions, *carry)
+        (suffix, j), (u, weights) = jax.lax.scan(one, (state.suffix, state.j), length=BLOCK)
         entry = jnp.arange(n, dtype=u.dtype)
         hats = [jnp.maximum(0.0, 1.0 - jnp.abs(u[i][:, None] - entry)) for i in range(BLOCK)]
         rows = jax.tree.map(lambda row, w: row + sum(hats[i] * w[i][:, None] for i in range(BLOCK)), state.rows, weights)
-        return _RowState(behind, j, rows), None
+        return _JacobianState(suffix, j, rows), None
 
-    back = BackLanes(lanes_of(rays, dt), *noted)
-    rows, _ = pooled_while(alive, advance, start, lambda state: state.rows, back, None, noted.following)
+    back = BackwardRays(active_rays(rays, dt), *record)
+    rows, _ = wavefront_while(alive, advance, start, lambda state: state.rows, back, None, record.following)
     return gathered, rows
 
 
-def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, of_extinctions: bool, behind: Behind, j: Int[Array, "rays"]):
+def _jacobian_segment(
+    medium: Medium, dt: Scalar, back: BackwardRays, of_extinctions: bool, suffix: SuffixRadiance, j: Int[Array, "rays"]
+):
     """One segment of every ray: the state before it, where its samples fall in the table, and the weights of their hats."""
-    j = back.leap(medium, dt, j)
-    lanes, (k, count) = back.lanes, back.at(j)
-    count = shown(medium, lanes, dt, k, count)
-    extent, distance = segment(k, count, lanes.rays.length, dt)
-    points = points_at(lanes.rays, lanes.ray, k, distance)
+    j = back.skip(medium, dt, j)
+    active, (k, count) = back.active, back.at(j)
+    count = occupied_count(medium, active, dt, k, count)
+    extent, distance = segment_span(k, count, active.rays.length, dt)
+    points = points_at(active.rays, active.ray, k, distance)
     samples = jax.vmap(medium.field.resample)(points)
-    samples = jax.vmap(medium.shader.prepare, in_axes=(None, 0, 0))(medium.transfer, samples, points)
+    samples = jax.vmap(medium.shader.in_world, in_axes=(None, 0, 0))(medium.transfer, samples, points)
     classified = jax.vmap(medium.shader.classify, in_axes=(None, 0))(medium.transfer, samples)
-    where = Stretch(lanes.rays, lanes.ray, k, distance, extent, k < count)
+    batch = SegmentBatch(active.rays, active.ray, k, distance, extent, k < count)
 
-    def seen(classified: Classified) -> tuple[Channels, Channels]:
+    def radiance_and_depth(classified: Classified) -> tuple[Channels, Channels]:
         # Where in the segment the light is looked up depends on its extinction; the light itself does not.
-        light = {} if medium.shadows is None else {"light": light_at(medium, where, classified.sigma_t, reverse=True)}
-        return jax.vmap(medium.shader.segment)(classified, samples._replace(**light), points, extent)
+        light = {} if medium.shadows is None else {"light": light_at(medium, batch, classified.sigma_t, reverse=True)}
+        return jax.vmap(medium.shader.shade)(classified, samples._replace(**light), points, extent)
 
-    (emitted, dtau), pull = jax.vjp(seen, classified)
-    front = back.depth(j, behind, dtau)
+    (emitted, dtau), pull = jax.vjp(radiance_and_depth, classified)
+    front = back.depth(j, suffix, dtau)
     before = transmittance(*front)
 
     radiance_rgb, radiance_sigma, tau_sigma = [], [], []
@@ -115,17 +117,17 @@ def _row_segment(medium: Medium, dt: Scalar, back: BackLanes, of_extinctions: bo
     nothing = Marched((zero,) * len(emitted), (zero,) * len(dtau), (), None)
     for c in range(len(emitted)):
         one = nothing._replace(radiance=_only(nothing.radiance, c))
-        (of_entry,) = pull(segment_cotangents(one, behind, before, dtau, distance)[:2])
+        (of_entry,) = pull(segment_cotangents(one, suffix, before, dtau, distance)[:2])
         radiance_rgb.append(of_entry.rgb[c])
         radiance_sigma.append(of_entry.sigma_t[c % len(of_entry.sigma_t)])
     for c in range(len(dtau) * of_extinctions):
         (of_entry,) = pull(((zero,) * len(emitted), _only(nothing.tau, c)))
         tau_sigma.append(of_entry.sigma_t[c])
-    weights = TableRows(tuple(radiance_rgb), tuple(radiance_sigma) * of_extinctions, tuple(tau_sigma))
+    weights = TableJacobian(tuple(radiance_rgb), tuple(radiance_sigma) * of_extinctions, tuple(tau_sigma))
     weights = jax.tree.map(lambda w: where_known((samples,), (w,))[0], weights)
     assert isinstance(medium.transfer, AbstractTable)
     u = jax.vmap(medium.transfer.coordinate)(samples.s)
-    return (step_back(behind, front, emitted, dtau, distance), j + (j < back.steps)), (u, weights)
+    return (step_back(suffix, front, emitted, dtau, distance), j + (j < back.steps)), (u, weights)
 
 
 def _only(channels: tuple[Array, ...], c: int) -> tuple[Array, ...]:

@@ -13,15 +13,15 @@ from jvr.model.harmonics.basis import count
 from jvr.model.transfer import AbstractTransfer
 
 
-class ProjectedTransfer(eqx.Module):
+class ProjectedRadianceTransfer(eqx.Module):
     """Radiance transfer as it was projected, for the transfer function of that time.
 
-    - `luminance`: `(x, y, z, 1, bands)` for a transfer without colour, else `(x, y, z, 3, bands)`, or the luma alone where
+    - `luminance`: `(x, y, z, 1, bands)` for a radiance transfer without colour, else `(x, y, z, 3, bands)`, or the luma alone where
     - `chroma`: `(x, y, z, 2, fewer bands)` holds orange-blue and green-purple differences (YCoCg); else `None`.
     - `solid`: `(x, y, z)`, how much of an opaque surface there is, from above 0 to 1; 0 where nothing is near and nothing was projected.
     - `facing`: `(x, y, z, 3)`, the unit vector away from the medium, shorter where that has hardly a direction.
     - `transfer`: the transfer function of that time, which the shadow of surfaces on themselves is found with.
-    - `made_for`: checksums of what it was made of (`jvr.model.kept.content`).
+    - `cache_key`: checksums of what it was made of (`jvr.model.kept.content`).
     - `scattered`: whether the scattering pass has been made.
     - `pinned`: whether it stays as it is although the scene is another.
     """
@@ -31,7 +31,7 @@ class ProjectedTransfer(eqx.Module):
     solid: Float[Array, "x y z"]
     facing: Float[Array, "x y z 3"]
     transfer: AbstractTransfer
-    made_for: UInt32[Array, "parts 2"]
+    cache_key: UInt32[Array, "parts 2"]
     scattered: bool = eqx.field(static=True, default=False)
     pinned: bool = eqx.field(static=True, default=False)
 
@@ -50,16 +50,16 @@ class ProjectedTransfer(eqx.Module):
         """Memory of the coefficients."""
         return sum(x.size * x.dtype.itemsize for x in (self.luminance, self.chroma, self.solid, self.facing) if x is not None)
 
-    def is_for(self, made_for: UInt32[Array | np.ndarray, "parts 2"]) -> Any:
+    def is_for(self, cache_key: UInt32[Array | np.ndarray, "parts 2"]) -> Any:
         """Whether it was made of what has these checksums: a `bool`, or a traced one."""
-        now, then = made_for, self.made_for
+        now, then = cache_key, self.cache_key
         if now.shape != then.shape:
             return False
         if isinstance(now, Tracer) or isinstance(then, Tracer):
             return jnp.all(now == then)
         return bool(np.all(np.asarray(now) == np.asarray(then)))
 
-    def separated(self, order: int) -> "ProjectedTransfer":
+    def separated(self, order: int) -> "ProjectedRadianceTransfer":
         """The same as luma, and colour differences up to an order (YCoCg, whose inverse is exact)."""
         red, green, blue = jnp.moveaxis(self.coefficients, 3, 0)
         luma = 0.25 * (red + blue) + 0.5 * green

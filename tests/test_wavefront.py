@@ -1,4 +1,4 @@
-"""The pool of lanes: every ray is advanced as often as it has work, whatever the sizes, and results keep their order."""
+"""The wavefront: every ray is advanced as often as it has work, whatever the sizes, and results keep their order."""
 
 import jax
 import jax.numpy as jnp
@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jvr.march import batch
+from jvr.march import wavefront
 
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch):
-    for name, value in {"POOL": 64, "TAIL": 8, "TOGETHER": 4}.items():
-        monkeypatch.setattr(batch, name, value)
+    for name, value in {"WAVEFRONT": 64, "TAIL": 8, "TOGETHER": 4}.items():
+        monkeypatch.setattr(wavefront, name, value)
 
 
 @jax.jit
@@ -31,7 +31,7 @@ def run(work: jax.Array):
     inputs = (jnp.arange(1, work.size + 1), work)
     alive = lambda inputs, state: state[0] < inputs[1]
     finish = lambda state: {"steps": state[0], "sum": state[1]}
-    return batch.pooled_while(alive, advance, start, finish, inputs, jnp.int32(0), inputs[1])
+    return wavefront.wavefront_while(alive, advance, start, finish, inputs, jnp.int32(0), inputs[1])
 
 
 @given(st.sampled_from([1, 64, 65, 203, 400]), st.integers(0, 2**31), st.sampled_from([0.0, 0.5, 0.95]))
@@ -56,9 +56,9 @@ def test_edges(size, fill):
     assert total == work.sum()
 
 
-def test_a_pool_smaller_than_its_tail_counts_no_lane_twice(monkeypatch):
-    """The queue is empty while all lanes are alive, so none of them can fill up the smaller pool."""
-    monkeypatch.setattr(batch, "TAIL", 100)
+def test_a_wavefront_smaller_than_its_tail_counts_no_ray_twice(monkeypatch):
+    """The queue is empty while all rays are alive, so none of them can fill up the smaller wavefront."""
+    monkeypatch.setattr(wavefront, "TAIL", 100)
     jax.clear_caches()
     work = np.repeat(np.array([50, 10, 5], np.int32), [48, 16, 16])
     results, total = run(work)

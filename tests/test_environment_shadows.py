@@ -1,4 +1,4 @@
-"""Light from all around against brute force: directional lights with shadow rays, which know no harmonics and no nodes."""
+"""Environment lighting against brute force: directional lights with shadow rays, which know no harmonics and no nodes."""
 
 import dataclasses
 import math
@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from scipy.special import expn
 
 import jvr
-from jvr.effects.own_shadow import OwnShadow, Segment
+from jvr.effects.self_shadow import SelfShadow, ShadedSegment
 from jvr.model.transfer import Classified
 
 TILT = rotation(0.25, 0.1, 0.35)
@@ -136,10 +136,10 @@ def test_the_shadow_that_a_surface_casts_on_itself(tau, strength):
     """Bands against SciPy's exponential integrals, for a scalar that falls to 0 within the width; of half a surface, up to half of it."""
     # From 1 to 0 over a distance of 3 the integral of the scalar is 1.5, up to its middle 1.125.
     linear = jvr.LinearTransfer([0.0, 1.0], [[1, 1, 1]] * 2, [0.0, tau / 1.5])
-    shadow = OwnShadow(linear, jnp.asarray(3.0), of_opacity=False, bleeds=False)
+    shadow = SelfShadow(linear, jnp.asarray(3.0), of_opacity=False, bleeds=False)
     up, s = tuple(map(jnp.asarray, (0.0, 0.0, 1.0))), jnp.asarray(1.0)
     slope = tuple(map(jnp.asarray, (0.0, 0.0, -1 / 3)))
-    here = Segment(Classified((s, s, s), (jnp.asarray(tau / 1.5),)), slope, jnp.asarray(0.0))
+    here = ShadedSegment(Classified((s, s, s), (jnp.asarray(tau / 1.5),)), slope, jnp.asarray(0.0))
     found = [band[0] for band in shadow.remaining(s, jnp.asarray(1 / 3), up, up, here, jnp.asarray(strength))]
     e = {n: expn(n, tau * (1.0 if strength == 1 else 0.75)) for n in (3, 4, 5)}
     # The rule of four places is a few percent of the depth off.
@@ -150,9 +150,9 @@ def test_a_shadow_of_what_is_densest_is_dark():
     """Without an overflow, in value and derivative."""
 
     def kept(sigma):
-        shadow = OwnShadow(jvr.LinearTransfer([0.0, 1.0], [[1, 1, 1]] * 2, [sigma, sigma]), jnp.asarray(3.0), False, False)
+        shadow = SelfShadow(jvr.LinearTransfer([0.0, 1.0], [[1, 1, 1]] * 2, [sigma, sigma]), jnp.asarray(3.0), False, False)
         up, s = tuple(map(jnp.asarray, (0.0, 0.0, 1.0))), jnp.asarray(1.0)
-        here = Segment(Classified((s, s, s), (sigma,)), up, jnp.asarray(1.0))
+        here = ShadedSegment(Classified((s, s, s), (sigma,)), up, jnp.asarray(1.0))
         return shadow.remaining(s, s, up, up, here, s)[0][0]
 
     value, slope = jax.value_and_grad(kept)(jnp.asarray(1e25))

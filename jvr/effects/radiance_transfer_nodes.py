@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.effects.natural_light import NaturalLight
+from jvr.effects.environment_lighting import EnvironmentLighting
 from jvr.effects.radiance_transfer import RadianceTransfer
-from jvr.effects.shading import share_of
+from jvr.effects.shading import surface_weight
 from jvr.march.medium import Medium
 from jvr.march.segments import classify_at
 from jvr.march.steps import Point
@@ -26,9 +26,9 @@ Numbers: TypeAlias = Float[Array, "..."]
 
 # Nodes that are projected together in one program.
 CHUNK = 256
-# A change of transparency that is a smaller share of `RadianceTransfer.surface` is none: it moves the cone's rim by less than 1e-6.
+# A change of transparency that is a smaller fraction of `RadianceTransfer.surface` is none: it moves the cone's rim by less than 1e-6.
 FLAT = 1e-3
-# Of such changes, those of a larger share than this have a direction.
+# Of such changes, those of a larger fraction than this have a direction.
 DIRECTED = 0.1
 # Azimuth between one direction and the next, the golden angle.
 GOLDEN = math.pi * (3 - math.sqrt(5))
@@ -48,35 +48,35 @@ def node_positions(volume: Volume, shape: tuple[int, int, int]) -> np.ndarray:
 
 
 def project_nodes(
-    transfer: RadianceTransfer,
+    radiance_transfer: RadianceTransfer,
     volume: Volume,
     clipping: ClippingBox | None,
     medium: Medium,
-    albedo: NaturalLight | None,
+    albedo: EnvironmentLighting | None,
     surfaces: bool,
     p: Float[Array, "nodes 3"],
 ) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
-    """Coefficients of the radiance transfer at grid positions, and beside each other `solid` and `facing` of `ProjectedTransfer`.
+    """Coefficients of the radiance transfer at grid positions, and beside each other `solid` and `facing` of `ProjectedRadianceTransfer`.
 
     **Arguments:** `medium`: what rays pass; `albedo`: where they pick up the material's colour, that under light of one from everywhere;
     `surfaces`: whether the material has a normal, so that light from below it does not count.
     """
     nodes = tuple(p.T.astype(volume.slope.dtype))
-    around = _surroundings(transfer, volume, medium, nodes)
+    around = _surroundings(radiance_transfer, volume, medium, nodes)
     strength = around.solid * around.strength if surfaces else jnp.zeros_like(around.strength)
     cone = Cone(around.axis, jnp.sin(0.5 * math.pi * (1 - strength)))
-    directions = _spread(cone, transfer.rays)
-    wide = lambda c: jnp.broadcast_to(c[:, None], (c.shape[0], transfer.rays)).ravel()
+    directions = _spread(cone, radiance_transfer.rays)
+    wide = lambda c: jnp.broadcast_to(c[:, None], (c.shape[0], radiance_transfer.rays)).ravel()
     along = tuple(d.ravel() for d in directions)
-    lift = volume.grid_from_world(tuple(strength * transfer.lift(volume) * c for c in around.axis), direction=True)
+    lift = volume.grid_from_world(tuple(strength * radiance_transfer.lift(volume) * c for c in around.axis), direction=True)
     origins = tuple(c + d for c, d in zip(nodes, lift, strict=True))
     rays = _rays(volume, clipping, tuple(map(wide, origins)), along)
-    carried = _carried(transfer, volume, medium, albedo, rays)
-    functions = jnp.stack(basis(transfer.order, directions), axis=-1)
+    carried = _carried(radiance_transfer, volume, medium, albedo, rays)
+    functions = jnp.stack(basis(radiance_transfer.order, directions), axis=-1)
     # Each sample counts by the inverse of its density, 2 pi (1 + sin alpha). Directions without rays count as the mean of those with: no
     # light of theirs is reflected, and a step at the horizon would ring. What is the same from everywhere has no error of the quadrature.
-    weight = 2 * math.pi * (1 + cone.sine) / transfer.rays
-    values = jnp.stack([c.reshape(p.shape[0], transfer.rays) for c in carried], axis=1)
+    weight = 2 * math.pi * (1 + cone.sine) / radiance_transfer.rays
+    values = jnp.stack([c.reshape(p.shape[0], radiance_transfer.rays) for c in carried], axis=1)
     mean = jnp.mean(values, axis=-1)
     rest = jnp.einsum("ncr,nrb->ncb", values - mean[..., None], functions) * weight[:, None, None]
     coefficients = rest.at[..., 0].add(math.sqrt(4 * math.pi) * mean)
@@ -95,15 +95,15 @@ class Surroundings(NamedTuple):
     axis: Triple
 
 
-def _surroundings(transfer: RadianceTransfer, volume: Volume, medium: Medium, p: Triple) -> Surroundings:
+def _surroundings(radiance_transfer: RadianceTransfer, volume: Volume, medium: Medium, p: Triple) -> Surroundings:
     """From the opacity of a node's width of medium at the node and one node further in all 26 directions, by Sobel's weights: both the
     nodes below a surface and those above it know where it faces."""
-    width = transfer.node_width(volume)
+    width = radiance_transfer.node_width(volume)
     lower, upper = volume.domain
     sides = [(-1, 0, 1) if n > 1 else (0,) for n in volume.shape]
     offsets = np.array(list(itertools.product(*sides)), np.float32)
     weights = np.prod(np.where(offsets == 0, 2.0, 1.0), axis=1)
-    step = 1 / transfer.resolution
+    step = 1 / radiance_transfer.resolution
     at = [jnp.clip(c[:, None] + step * o, low, high) for c, o, low, high in zip(p, offsets.T, lower, upper, strict=True)]
     flat = tuple(c.ravel() for c in at)
     sigma_t = classify_at(medium, _points(flat, flat), jnp.ones(flat[0].shape, bool))[0].sigma_t
@@ -123,10 +123,10 @@ def _surroundings(transfer: RadianceTransfer, volume: Volume, medium: Medium, p:
     gradient = tuple(sum((inverse[j, i] * differences[j] for j in range(3)), jnp.zeros_like(p[0])) for i in range(3))
     axis, length = direction_and_length(gradient)
     # Without a surface the axis only turns the spiral; inside of an opaque medium a gradient would be made of roundings.
-    flat_there = length * width <= FLAT * transfer.surface
+    flat_there = length * width <= FLAT * radiance_transfer.surface
     axis = tuple(jnp.where(flat_there, fixed, c) for fixed, c in zip((0.0, 0.0, 1.0), axis, strict=True))
-    strength = share_of(2 * length * width, jnp.asarray(transfer.surface, length.dtype))
-    directed = share_of(2 * length * width, jnp.asarray(DIRECTED * transfer.surface, length.dtype))
+    strength = surface_weight(2 * length * width, jnp.asarray(radiance_transfer.surface, length.dtype))
+    directed = surface_weight(2 * length * width, jnp.asarray(DIRECTED * radiance_transfer.surface, length.dtype))
     strength, directed = (jnp.where(flat_there, 0.0, x) for x in (strength, directed))
     return Surroundings(jnp.max(opacity, axis=1), strength, directed, axis)
 
@@ -162,10 +162,12 @@ def _rays(volume: Volume, clipping: ClippingBox | None, p: Triple, direction: Tr
     return _Rays(p, direction, along, jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0))
 
 
-def _carried(transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo: NaturalLight | None, rays: _Rays) -> Channels:
+def _carried(
+    radiance_transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo: EnvironmentLighting | None, rays: _Rays
+) -> Channels:
     """What rays carry from far away to grid positions: transmittance, or with bleeding white light behind the colours of what they pass."""
-    ends = jnp.asarray(transfer.boundaries(volume.shape), rays.t_out.dtype) * 2 * volume.radius
-    opaque = -math.log(transfer.termination) if transfer.termination > 0 else math.inf
+    ends = jnp.asarray(radiance_transfer.boundaries(volume.shape), rays.t_out.dtype) * 2 * volume.radius
+    opaque = -math.log(radiance_transfer.termination) if radiance_transfer.termination > 0 else math.inf
     lower, upper = volume.domain
     toward_origin = tuple(-d for d in rays.direction)
 
@@ -176,16 +178,16 @@ def _carried(transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo:
         # By a rounding the middle may be outside, where nothing may be read.
         at = tuple(rounded_into(c + middle * d, a, b) for c, d, a, b in zip(rays.p, rays.along, lower, upper, strict=True))
         inside = (end > begin) & (_least(tau) < opaque)
-        medium_there, sample = classify_at(medium, _points(at, rays.along), inside)
-        dtau = tuple(jnp.where(inside, sigma * (end - begin), 0.0) for sigma in medium_there.sigma_t)
+        classified, sample = classify_at(medium, _points(at, rays.along), inside)
+        dtau = tuple(jnp.where(inside, sigma * (end - begin), 0.0) for sigma in classified.sigma_t)
         if colour:
-            rgb = _colour(medium_there.rgb, sample, albedo, toward_origin)
+            rgb = _colour(classified.rgb, sample, albedo, toward_origin)
             before = [jnp.exp(-t) for t in tau] * (3 // len(tau))
             thick = dtau * (3 // len(dtau))
             colour = tuple(c - T * jnp.expm1(-d) * e for c, T, d, e in zip(colour, before, thick, rgb, strict=True))
         return tuple(t + d for t, d in zip(tau, dtau, strict=True)), colour
 
-    # Checkpointed: the way back computes a step again rather than keep all of its voxels.
+    # Checkpointed: the reverse pass computes a step again rather than keep all of its voxels.
     @jax.checkpoint
     def step(state: tuple[Channels, Channels], ends: tuple[Numbers, Numbers]) -> tuple[tuple[Channels, Channels], None]:
         alive = (ends[0] < rays.t_out) & (ends[1] > rays.t_in) & (_least(state[0]) < opaque)
@@ -193,13 +195,13 @@ def _carried(transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo:
 
     zero = jnp.zeros_like(rays.t_out)
     channels = len(jax.eval_shape(lambda: classify_at(medium, _points(rays.p, rays.along), zero > 0)[0].sigma_t))
-    state = ((zero,) * channels, () if transfer.bleeding is None else (zero,) * 3)
+    state = ((zero,) * channels, () if radiance_transfer.bleeding is None else (zero,) * 3)
     (tau, colour), _ = jax.lax.scan(step, state, (ends[:-1], ends[1:]))
     clear = tuple(jnp.exp(-t) for t in tau)
     return tuple(c + T for c, T in zip(colour, clear * (3 // channels), strict=True)) if colour else clear
 
 
-def _colour(rgb: Triple, sample: Any, albedo: NaturalLight | None, w_o: Triple) -> Triple:
+def _colour(rgb: Triple, sample: Any, albedo: EnvironmentLighting | None, w_o: Triple) -> Triple:
     """What a ray picks up of a sample: the colour of the transfer function, or what the material reflects of light from everywhere."""
     if albedo is None:
         return rgb
@@ -210,8 +212,8 @@ def _colour(rgb: Triple, sample: Any, albedo: NaturalLight | None, w_o: Triple) 
 
     # A material without a normal asks for no gradient.
     gradient = sample.gradient or (jnp.zeros_like(sample.s),) * 3
-    tinted, plain = jax.vmap(one)(sample.s, gradient, w_o)
-    return tuple(c * a + b for c, a, b in zip(rgb, tinted, plain, strict=True))
+    tinted, unmodulated = jax.vmap(one)(sample.s, gradient, w_o)
+    return tuple(c * a + b for c, a, b in zip(rgb, tinted, unmodulated, strict=True))
 
 
 def _least(tau: Channels) -> Numbers:

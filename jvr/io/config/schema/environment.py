@@ -1,4 +1,4 @@
-"""Tables of light from all around: environments, materials, radiance transfer.
+"""Tables of environment lighting: environments, materials, radiance transfer.
 
 A parameter that is left out has the default of its class in jvr.
 """

@@ -1,4 +1,4 @@
-"""Light from all around, materials under it, and radiance transfer: closed forms, white furnace, independent sums, gradients."""
+"""Environment lighting, materials under it, and radiance transfer: closed forms, white furnace, independent sums, gradients."""
 
 import dataclasses
 import itertools
@@ -14,8 +14,8 @@ from scenes import OBLIQUE, compiled, linear_transfer, perspective, rotation, vo
 
 import jvr
 from jvr.effects.diffusion import kernel_of, scatter
-from jvr.effects.natural_light import natural_light
-from jvr.effects.transfer_grid import TransferProjection, project_all
+from jvr.effects.environment_lighting import environment_lighting
+from jvr.effects.radiance_transfer_grid import RadianceTransferProjection, project_all
 from jvr.model.harmonics.projection import sphere_nodes
 from jvr.rendering.medium import absorbing
 
@@ -41,9 +41,9 @@ def picture(scene, settings=SETTINGS):
 
 def transfer_at(scene):
     """Coefficients at the nodes of a scene, `(nodes, channels, bands)`, and `solid` and `facing` side by side."""
-    return compiled(lambda s: project_all(TransferProjection.of(s, absorbing(s, None, s.radiance_transfer.needs_gradient))))(
-        scene
-    )
+    return compiled(
+        lambda s: project_all(RadianceTransferProjection.of(s, absorbing(s, None, s.radiance_transfer.needs_gradient)))
+    )(scene)
 
 
 # --- light -----------------------------------------------------------------------------------------------------------
@@ -115,7 +115,7 @@ def test_what_is_reflected_is_the_integral_of_material_and_light(name):
     with jax.enable_x64(True):
         brdf, env = jax.tree.map(lambda x: x.astype(float), (brdf, env))
         material = jvr.HarmonicMaterial.project(brdf, 3, directions=64, nodes=48)
-        natural = natural_light(material, env.coefficients, clamped=False, order=3, from_samples=False)
+        lighting = environment_lighting(material, env.coefficients, clamped=False, order=3, from_samples=False)
         nodes, weights = sphere_nodes(160)
         functions, radiance = np.asarray(jvr.sh.evaluate(3, nodes)), np.asarray(env.coefficients)
         rng = np.random.default_rng(0)
@@ -126,7 +126,7 @@ def test_what_is_reflected_is_the_integral_of_material_and_light(name):
             frame = np.stack([t / np.linalg.norm(t), np.cross(n, t / np.linalg.norm(t)), n])
             own_o, own_i = frame @ w_o, frame @ nodes.T
             parts = brdf.evaluate(tuple(map(jnp.asarray, own_o)), tuple(map(jnp.asarray, own_i)))
-            found = natural.reflect(jnp.asarray(0.5), jnp.asarray(1.0), tuple(jnp.asarray(n)), tuple(jnp.asarray(w_o)), ())
+            found = lighting.reflect(jnp.asarray(0.5), jnp.asarray(1.0), tuple(jnp.asarray(n)), tuple(jnp.asarray(w_o)), ())
             for part, value in zip(parts, found, strict=True):
                 expected = [
                     (functions.T @ (weights * np.asarray(part[c % len(part)]))) @ radiance[:, c] if part else 0.0
@@ -158,7 +158,7 @@ def test_materials_by_value_are_linear_between_their_positions():
     both = jvr.MaterialByValue([0.0, 1.0], kinds).projected(3)
     alone = [kind.projected(3) for kind in kinds]
     n, w_o = (jnp.array(v) / np.linalg.norm(v) for v in ([1.0, 2, 3], [1.0, 0, 2]))
-    at = lambda m, s: natural_light(m, light().coefficients, clamped=True, order=3, from_samples=False).reflect(
+    at = lambda m, s: environment_lighting(m, light().coefficients, clamped=True, order=3, from_samples=False).reflect(
         jnp.asarray(s), jnp.asarray(1.0), tuple(n), tuple(w_o), ()
     )[0]
     values = [np.array(at(m, 0.0)) for m in alone]
@@ -203,7 +203,7 @@ def test_above_an_opaque_half_space(material):
         material=material,
         radiance_transfer=jvr.RadianceTransfer(rays=1024, resolution=0.1),
     )
-    projection = TransferProjection.of(half_space, absorbing(half_space, None, False))
+    projection = RadianceTransferProjection.of(half_space, absorbing(half_space, None, False))
     c, around = compiled(lambda q, p: q.project(p))(projection, jnp.array([[20.0, 20.0, 10.2], [20.0, 20.0, 9.0]]))
     from jvr.model.harmonics.projection import cap
 
@@ -354,7 +354,7 @@ def test_what_is_kept_may_be_deleted_at_any_time(tmp_path):
 
 @pytest.mark.parametrize("bleeding", [None, pytest.param(jvr.MaterialBleeding(), marks=pytest.mark.slow)])
 def test_what_was_computed_for_another_scene_is_refused(bleeding):
-    """With arrays at hand, and where the scene is an argument of a compiled function."""
+    """With concrete arrays, and where the scene is an argument of a compiled function."""
     frozen = jvr.precompute(scene(transfer=jvr.RadianceTransfer(rays=4, resolution=0.4, bleeding=bleeding)))
     camera, volume = perspective(frozen.volume, width=4, height=4), frozen.volume
     compiled_render = compiled(lambda s: jvr.render(s, camera, SETTINGS).rgb)
@@ -363,7 +363,7 @@ def test_what_was_computed_for_another_scene_is_refused(bleeding):
     # Equal numbers in other arrays are no other scene.
     np.testing.assert_array_equal(compiled_render(jax.tree.map(jnp.array, frozen)), expected)
     relit = dataclasses.replace(frozen, environment=light(seed=7))
-    assert relit.radiance_transfer.outdated(relit) == ()
+    assert relit.radiance_transfer.stale(relit) == ()
     changed = {
         "transfer function": dataclasses.replace(frozen, transfer=linear_transfer(seed=5)),
         "volume": dataclasses.replace(frozen, volume=jvr.Volume(voxels(volume.shape, seed=9), OBLIQUE)),
@@ -380,7 +380,7 @@ def test_what_was_computed_for_another_scene_is_refused(bleeding):
     for name, other in changed.items():
         with pytest.raises(ValueError, match=r"another .*jvr.precompute\(scene\) again"):
             jvr.render(other, camera, SETTINGS)
-        assert other.radiance_transfer.outdated(other), name
+        assert other.radiance_transfer.stale(other), name
     for name in ("transfer function", "one voxel"):
         with pytest.raises(Exception, match=r"another .*jvr.precompute\(scene\) again"):
             jax.block_until_ready(compiled_render(changed[name]))

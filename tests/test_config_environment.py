@@ -1,4 +1,4 @@
-"""Configurations of scenes under light from all around: tables become what Python would make, and mistakes are one line."""
+"""Configurations of scenes under environment lighting: tables become what Python would make, and mistakes are one line."""
 
 import math
 from pathlib import Path
@@ -13,7 +13,7 @@ import jvr
 from jvr.io.config import build_fit, build_scene, read_config
 from jvr.pictures import write_image
 
-NATURAL = 'environment = "constant"\nmaterial = "lambert"\n' + BASE
+ENVIRONMENT = 'environment = "constant"\nmaterial = "lambert"\n' + BASE
 DISC = "{kind='disc',towards=[0,0,1],half_angle=20}"
 PHASE = jvr.HenyeyGreenstein(0.4)
 
@@ -44,28 +44,28 @@ def sky(tmp_path):
     ],
 )
 def test_an_environment_is_a_name_or_a_table(text, wanted):
-    assert same(scene_of(NATURAL, f"environment={text}").environment, wanted)
+    assert same(scene_of(ENVIRONMENT, f"environment={text}").environment, wanted)
 
 
 def test_environments_of_a_list_are_summed():
-    found = scene_of(NATURAL, f"environment=['constant',{DISC}]").environment
+    found = scene_of(ENVIRONMENT, f"environment=['constant',{DISC}]").environment
     assert same(found, jvr.EnvironmentLight.constant() + jvr.EnvironmentLight.disc([0, 0, 1], 20))
 
 
 def test_an_environment_is_read_from_an_image(sky):
-    found = scene_of(NATURAL, f"environment={{kind='image',path='{sky}',order=2,window=4.5}}").environment
+    found = scene_of(ENVIRONMENT, f"environment={{kind='image',path='{sky}',order=2,window=4.5}}").environment
     assert same(found, jvr.EnvironmentLight.from_image(sky, 2, window=4.5))
-    half = scene_of(NATURAL, f"environment={{kind='image',path='{sky}',scale=0.5}}").environment
+    half = scene_of(ENVIRONMENT, f"environment={{kind='image',path='{sky}',scale=0.5}}").environment
     np.testing.assert_allclose(half.coefficients, 0.5 * jvr.EnvironmentLight.from_image(sky).coefficients, rtol=1e-6)
 
 
 def test_an_environment_is_turned_about_its_axes_in_their_order():
     """Counter-clockwise, seen from the tip of the axis: first +z to -y about x, then -y to +x about z."""
     first = "{axis=[2,0,0],degrees=90}"
-    found = scene_of(NATURAL, f"environment={{kind='disc',towards=[0,0,1],half_angle=20,rotation={first}}}").environment
+    found = scene_of(ENVIRONMENT, f"environment={{kind='disc',towards=[0,0,1],half_angle=20,rotation={first}}}").environment
     np.testing.assert_allclose(found.coefficients, jvr.EnvironmentLight.disc([0, -1, 0], 20).coefficients, atol=1e-6)
     turns = f"[{first},{{axis=[0,0,1],degrees=90}}]"
-    found = scene_of(NATURAL, f"environment={{kind='disc',towards=[0,0,1],half_angle=20,rotation={turns}}}").environment
+    found = scene_of(ENVIRONMENT, f"environment={{kind='disc',towards=[0,0,1],half_angle=20,rotation={turns}}}").environment
     np.testing.assert_allclose(found.coefficients, jvr.EnvironmentLight.disc([1, 0, 0], 20).coefficients, atol=1e-6)
 
 
@@ -84,22 +84,22 @@ MATERIALS = [
 
 @pytest.mark.parametrize(("text", "wanted"), MATERIALS)
 def test_a_material_is_a_name_or_a_table(text, wanted):
-    assert same(scene_of(NATURAL, f"material={text}").material, wanted)
+    assert same(scene_of(ENVIRONMENT, f"material={text}").material, wanted)
 
 
 def test_a_material_with_a_threshold_is_projected_up_to_the_order_of_the_light():
-    found = scene_of(NATURAL, f"environment=['constant',{DISC}]", "material={kind='lambert',threshold=0.5}").material
+    found = scene_of(ENVIRONMENT, f"environment=['constant',{DISC}]", "material={kind='lambert',threshold=0.5}").material
     assert same(found, jvr.HarmonicMaterial.project(jvr.LambertBRDF(), 3, threshold=0.5))
 
 
 def test_materials_by_value():
     text = "{positions=[0.1,0.9],materials=['lambert',{kind='phong',diffuse=0.5}]}"
     assert same(
-        scene_of(NATURAL, f"material={text}").material,
+        scene_of(ENVIRONMENT, f"material={text}").material,
         jvr.MaterialByValue([0.1, 0.9], [jvr.LambertBRDF(), jvr.PhongBRDF(0.5)]),
     )
     found = scene_of(
-        NATURAL,
+        ENVIRONMENT,
         f"material={text.replace(chr(39) + 'lambert' + chr(39), '{kind=' + chr(39) + 'lambert' + chr(39) + ',threshold=0.5}')}",
     )
     assert float(found.material.projected(0).threshold) == 0.5
@@ -110,7 +110,7 @@ def test_a_measured_material_is_read_from_a_file(tmp_path):
     with path.open("wb") as file:
         np.array([90, 90, 180], "<i4").tofile(file)
         np.full(3 * 90 * 90 * 180, 150.0).tofile(file)
-    found = scene_of(NATURAL, f"material={{kind='merl',path='{path}'}}").material
+    found = scene_of(ENVIRONMENT, f"material={{kind='merl',path='{path}'}}").material
     assert same(found, jvr.MerlBRDF.read(path))
 
 
@@ -146,12 +146,12 @@ def test_a_measured_material_is_read_from_a_file(tmp_path):
     ],
 )
 def test_radiance_transfer_is_a_table(text, wanted):
-    assert same(scene_of(NATURAL, f"radiance_transfer={text}").radiance_transfer, wanted)
+    assert same(scene_of(ENVIRONMENT, f"radiance_transfer={text}").radiance_transfer, wanted)
 
 
 def test_a_volume_keeps_the_gradients_that_a_material_asks_for():
-    assert scene_of(NATURAL, "normals=precomputed").volume.gradients is not None
-    assert scene_of(NATURAL, "normals=precomputed", "material={kind='phase',phase='isotropic'}").volume.gradients is None
+    assert scene_of(ENVIRONMENT, "normals=precomputed").volume.gradients is not None
+    assert scene_of(ENVIRONMENT, "normals=precomputed", "material={kind='phase',phase='isotropic'}").volume.gradients is None
 
 
 @pytest.mark.parametrize(
@@ -209,8 +209,8 @@ def test_a_volume_keeps_the_gradients_that_a_material_asks_for():
         ("radiance_transfer={frozen='yes'}", "radiance_transfer.frozen", "true or false"),
     ],
 )
-def test_mistakes_about_natural_light_are_named(change, key, hint):
-    line = refusal(build_scene, NATURAL, change.replace("PROJECT", str(Path(__file__).parents[1] / "pyproject.toml")))
+def test_mistakes_about_environment_lighting_are_named(change, key, hint):
+    line = refusal(build_scene, ENVIRONMENT, change.replace("PROJECT", str(Path(__file__).parents[1] / "pyproject.toml")))
     assert f"{key}: " in line
     assert hint in line
 
@@ -237,7 +237,7 @@ def test_files_that_cannot_be_read_are_named(name, tmp_path):
     else:
         path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 4 +X 8\n\x02")
     text = f"material={{kind='merl',path='{path}'}}" if name == "cut.binary" else f"environment={{kind='image',path='{path}'}}"
-    line = refusal(build_scene, NATURAL, text)
+    line = refusal(build_scene, ENVIRONMENT, text)
     assert line.count(str(path)) == 1
     assert "path: " in line
 
@@ -245,15 +245,15 @@ def test_files_that_cannot_be_read_are_named(name, tmp_path):
 # --- fits ------------------------------------------------------------------------------------------------------------
 
 FIT = (
-    NATURAL.replace("[transfer]", "[truth]").replace('kind = "window"', "PLAIN")
+    ENVIRONMENT.replace("[transfer]", "[truth]").replace('kind = "window"', "PLAIN")
     + "[settings]\nstep = 8\n[camera]\nwidth = 3\nheight = 3\n"
 )
 FIT = FIT.replace("PLAIN", 'kind = "linear"\npositions = [0, 1]\nrgb = [[1, 1, 1], [1, 1, 1]]\nsigma_t = [0, 0.1]')
 TRANSFER = "radiance_transfer={rays=4,resolution=0.1,scattering='skin1'}"
 
 
-def job(unknowns, *sets, prepare=jvr.precompute):
-    return build_fit(config(f"{FIT}[fit]\nunknowns = {unknowns}\n", *sets), prepare=prepare)
+def job(unknowns, *sets, precompute=jvr.precompute):
+    return build_fit(config(f"{FIT}[fit]\nunknowns = {unknowns}\n", *sets), precompute=precompute)
 
 
 def asked_for(unknowns, *sets):
@@ -264,13 +264,13 @@ def asked_for(unknowns, *sets):
         calls.append((scene, keywords))
         return scene
 
-    found = job(unknowns, TRANSFER, *sets, prepare=note)
+    found = job(unknowns, TRANSFER, *sets, precompute=note)
     scene, keywords = calls[0]
     return scene.radiance_transfer is not None, keywords["keep_material"], keywords["keep_unscattered"], found
 
 
 @pytest.mark.parametrize(
-    ("unknowns", "keep_material", "keep_unscattered", "keeps_transfer"),
+    ("unknowns", "keep_material", "keep_unscattered", "keeps_radiance_transfer"),
     [
         (["environment.coefficients"], False, False, False),
         (["material.reflectance"], True, False, False),
@@ -279,14 +279,14 @@ def asked_for(unknowns, *sets):
         (["volume.values", "material.reflectance"], True, False, True),
     ],
 )
-def test_a_fit_computes_beforehand_what_it_does_not_find(unknowns, keep_material, keep_unscattered, keeps_transfer):
+def test_a_fit_computes_beforehand_what_it_does_not_find(unknowns, keep_material, keep_unscattered, keeps_radiance_transfer):
     *asked, found = asked_for(unknowns)
     assert asked == [True, keep_material, keep_unscattered]
-    assert found.keeps_transfer == keeps_transfer
+    assert found.keeps_radiance_transfer == keeps_radiance_transfer
     # Told to follow, it leaves to each picture what the unknowns change, and that alone.
     *asked, found = asked_for(unknowns, "radiance_transfer.frozen=false")
-    assert asked == [not keeps_transfer, keep_material, keep_unscattered]
-    assert not found.keeps_transfer
+    assert asked == [not keeps_radiance_transfer, keep_material, keep_unscattered]
+    assert not found.keeps_radiance_transfer
     assert found.scene.radiance_transfer is not None
 
 
@@ -294,10 +294,10 @@ def test_a_fit_computes_beforehand_what_it_does_not_find(unknowns, keep_material
 def test_radiance_transfer_with_the_materials_colour_is_that_of_the_start():
     """Kept for an unknown material as it is, and not announced as that of another."""
     found = job(["material.reflectance"], "radiance_transfer={rays=4,resolution=0.1,bleeding='material'}")
-    assert found.keeps_transfer
+    assert found.keeps_radiance_transfer
     assert found.scene.radiance_transfer.is_frozen
     assert isinstance(found.scene.material, jvr.LambertBRDF)
-    assert found.scene.radiance_transfer.outdated(found.scene) == ()
+    assert found.scene.radiance_transfer.stale(found.scene) == ()
 
 
 @pytest.mark.slow
@@ -312,7 +312,7 @@ def test_a_fit_of_the_light_starts_from_another_environment(sky):
 
 def test_a_white_furnace_is_white():
     """A matte white medium that hides its surroundings, under light of one from everywhere."""
-    made = build_scene(config(NATURAL, "transfer={kind='linear',positions=[-1,2],rgb=[[1,1,1],[1,1,1]],sigma_t=[9,9]}"))
+    made = build_scene(config(ENVIRONMENT, "transfer={kind='linear',positions=[-1,2],rgb=[[1,1,1],[1,1,1]],sigma_t=[9,9]}"))
     camera = jvr.PerspectiveCamera.look_at((0.0, -200.0, 0.0), (0.0, 0.0, 0.0), (0, 0, 1), 5.0, 3, 3)
     picture = jvr.render(jvr.precompute(made), camera, jvr.Settings(1.0))
     assert math.isclose(float(jnp.max(jnp.abs(picture.rgb - 1))), 0, abs_tol=1e-3)
@@ -320,7 +320,7 @@ def test_a_white_furnace_is_white():
 
 # --- documentation ---------------------------------------------------------------------------------------------------
 
-PAGE = (Path(__file__).parents[1] / "docs" / "natural_light.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[1] / "docs" / "environment_lighting.md").read_text(encoding="utf-8")
 
 
 def test_the_config_of_the_documentation_is_valid():

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jvr.effects.environment_lighting import EnvironmentLighting, albedo_of
 from jvr.effects.grid import Grid
-from jvr.effects.natural_light import NaturalLight, albedo_of
-from jvr.effects.projected_transfer import ProjectedTransfer
+from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
 from jvr.effects.radiance_transfer import RadianceTransfer
-from jvr.effects.transfer_nodes import CHUNK, node_positions, project_nodes
+from jvr.effects.radiance_transfer_nodes import CHUNK, node_positions, project_nodes
 from jvr.execution.devices import over_rays, shares
 from jvr.execution.tiles import dealt, joined
 from jvr.march.medium import AbstractVisibility, Medium
@@ -27,13 +27,13 @@ from jvr.model.volume import ClippingBox, Volume
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import Channels
 
-# Weight of the light from all around beside that which a surface faces.
+# Weight of the environment lighting beside that which a surface faces.
 DARK = 0.005
 
 
-class TransferVisibility(AbstractVisibility):
-    """What `inner` says of the scene's lights and, as one more light, of the environment: its share that arrives in each colour, or the
-    coefficients of what arrives, all colours of the first, then of the next."""
+class RadianceTransferVisibility(AbstractVisibility):
+    """What `inner` says of the scene's lights and, as one more light, of the environment: the fraction of it that arrives in each colour,
+    or the coefficients of what arrives, all colours of the first, then of the next."""
 
     grid: Grid
     scale: tuple[float, float, float] = eqx.field(static=True)
@@ -51,92 +51,94 @@ class TransferVisibility(AbstractVisibility):
         return None if self.inner is None else self.inner.stats
 
 
-def transfer_visibility(scene: Scene, medium: Medium, inner: AbstractVisibility | None, lights: int) -> TransferVisibility:
+def radiance_transfer_visibility(
+    scene: Scene, medium: Medium, inner: AbstractVisibility | None, lights: int
+) -> RadianceTransferVisibility:
     """How much of the environment reaches each sample of a scene.
 
     **Arguments:** `medium`: what rays pass; `lights`: how many others `inner` knows.
     """
-    transfer, environment = transfer_of(scene), scene.environment
+    radiance_transfer, environment = radiance_transfer_of(scene), scene.environment
     assert environment is not None
     assert scene.material is not None
     material = scene.material
-    projected = transfer.projected
+    projected = radiance_transfer.projected
     if projected is None:
-        projected = finished(scene, *project_all(TransferProjection.of(scene, medium)))
-    elif transfer.scattering is not None and not projected.scattered:
+        projected = finished(scene, *project_all(RadianceTransferProjection.of(scene, medium)))
+    elif radiance_transfer.scattering is not None and not projected.scattered:
         projected = scattered(scene, projected)
     coefficients, light = projected.coefficients, environment.coefficients
-    if transfer.exact:
+    if radiance_transfer.exact:
         order = material.projected(scene.material_order).order
-        arriving = _over_nodes(lambda light, nodes: _products(nodes, light, order), light, coefficients)
+        incident = _over_nodes(lambda light, nodes: _products(nodes, light, order), light, coefficients)
     else:
-        arriving = _over_nodes(lambda light, nodes: _shares(*nodes, light), light, (projected.facing, coefficients))
+        incident = _over_nodes(lambda light, nodes: _fractions(*nodes, light), light, (projected.facing, coefficients))
     if material.needs_gradient:
-        arriving = jnp.concatenate([arriving, projected.solid[..., None]], axis=-1)
+        incident = jnp.concatenate([incident, projected.solid[..., None]], axis=-1)
     shape = coefficients.shape[:3]
     x, y, z = ((m - 1) / (n - 1) if n > 1 else 0.0 for n, m in zip(scene.volume.shape, shape, strict=True))
-    return TransferVisibility(Grid.of(arriving), (x, y, z), inner, lights)
+    return RadianceTransferVisibility(Grid.of(incident), (x, y, z), inner, lights)
 
 
-def transfer_of(scene: Scene) -> RadianceTransfer:
+def radiance_transfer_of(scene: Scene) -> RadianceTransfer:
     """The radiance transfer of a scene that has one."""
     assert isinstance(scene.radiance_transfer, RadianceTransfer)
     return scene.radiance_transfer
 
 
-def projected_of(scene: Scene) -> ProjectedTransfer:
+def projected_of(scene: Scene) -> ProjectedRadianceTransfer:
     """The radiance transfer of a scene that it has been computed for."""
-    projected = transfer_of(scene).projected
+    projected = radiance_transfer_of(scene).projected
     assert projected is not None
     return projected
 
 
-class TransferProjection(eqx.Module):
+class RadianceTransferProjection(eqx.Module):
     """All that the nodes of a scene are projected with. `albedo`: what a material reflects of light of one from everywhere, where rays
     pick that up; `surfaces`: whether the material has a normal."""
 
-    transfer: RadianceTransfer
+    radiance_transfer: RadianceTransfer
     volume: Volume
     clipping: ClippingBox | None
     medium: Medium
-    albedo: NaturalLight | None
+    albedo: EnvironmentLighting | None
     surfaces: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, scene: Scene, medium: Medium) -> "TransferProjection":
+    def of(cls, scene: Scene, medium: Medium) -> "RadianceTransferProjection":
         """`medium`: what the scene's rays of light pass."""
-        transfer = transfer_of(scene)
-        transfer.check_memory(scene.volume, scene.transfer)
+        radiance_transfer = radiance_transfer_of(scene)
+        radiance_transfer.check_memory(scene.volume, scene.transfer)
         assert scene.material is not None
-        return cls(transfer, scene.volume, scene.clipping, medium, albedo_of(scene), scene.material.needs_gradient)
+        return cls(radiance_transfer, scene.volume, scene.clipping, medium, albedo_of(scene), scene.material.needs_gradient)
 
     def positions(self) -> np.ndarray:
-        return node_positions(self.volume, self.transfer.shape(self.volume))
+        return node_positions(self.volume, self.radiance_transfer.shape(self.volume))
 
     def nodes(self, index: Int[Array, "nodes"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
-        """The transfer of some nodes, a chunk at a time."""
+        """The radiance transfer of some nodes, a chunk at a time."""
         fill = -index.shape[0] % CHUNK
         chunks = jnp.pad(jnp.asarray(self.positions())[index], ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3)
         found = jax.lax.map(lambda p: self.project(p), chunks)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: index.shape[0]], found)
 
     def project(self, p: Float[Array, "nodes 3"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
-        """The transfer at grid positions."""
-        return project_nodes(self.transfer, self.volume, self.clipping, self.medium, self.albedo, self.surfaces, p)
+        """The radiance transfer at grid positions."""
+        return project_nodes(self.radiance_transfer, self.volume, self.clipping, self.medium, self.albedo, self.surfaces, p)
 
     def active(self) -> Bool[Array, "nodes"]:
         """Nodes with something visible no further away than the next node."""
         p, occupancy = jnp.asarray(self.positions()), self.medium.occupancy
         if occupancy is None:
             return jnp.ones(p.shape[0], bool)
-        bricks, shape = occupancy.reach.shape, self.transfer.shape(self.volume)
+        bricks, shape = occupancy.empty_radius.shape, self.radiance_transfer.shape(self.volume)
         b = [jnp.clip((p[:, i] / occupancy.size).astype(jnp.int32), 0, n - 1) for i, n in enumerate(bricks)]
         near = max((n - 1) / max(m - 1, 1) for n, m in zip(self.volume.shape, shape, strict=True))
-        return occupancy.reach[b[0], b[1], b[2]] <= math.ceil(near / occupancy.size)
+        return occupancy.empty_radius[b[0], b[1], b[2]] <= math.ceil(near / occupancy.size)
 
 
-def project_all(projection: TransferProjection) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
-    """The transfer of all nodes of a scene, zero where nothing is to be seen; chunks without an active node are left out. Traceable."""
+def project_all(projection: RadianceTransferProjection) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
+    """The radiance transfer of all nodes, zero where nothing is to be seen; chunks without an active node are left out. Traceable."""
     p, active = projection.positions(), projection.active()
     fill = -len(p) % CHUNK
     chunks = jnp.asarray(np.pad(p, ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3))
@@ -144,7 +146,7 @@ def project_all(projection: TransferProjection) -> tuple[Float[Array, "nodes cha
     # Not the bound method: JAX hashes what it is to call, and Equinox all that a method is bound to.
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda p: projection.project(p), chunks[0]))
 
-    def share(projection: TransferProjection, inputs: tuple[Array, Array]) -> Any:
+    def share(projection: RadianceTransferProjection, inputs: tuple[Array, Array]) -> Any:
         def chunk(inputs: tuple[Array, Array]) -> Any:
             p, busy = inputs
             found = jax.lax.cond(jnp.any(busy), lambda p: projection.project(p), lambda p: blank, p)
@@ -159,24 +161,26 @@ def project_all(projection: TransferProjection) -> tuple[Float[Array, "nodes cha
 
 def finished(
     scene: Scene, coefficients: Float[Array, "nodes channels bands"], around: Float[Array, "nodes 4"]
-) -> ProjectedTransfer:
+) -> ProjectedRadianceTransfer:
     """What was projected, scattered and with its colour differences apart where the scene asks for that."""
-    transfer = transfer_of(scene)
-    shape = transfer.shape(scene.volume)
-    made_for = jnp.asarray(transfer.made_for(scene))
+    radiance_transfer = radiance_transfer_of(scene)
+    shape = radiance_transfer.shape(scene.volume)
+    cache_key = jnp.asarray(radiance_transfer.cache_key(scene))
     grid, around = coefficients.reshape(*shape, *coefficients.shape[1:]), around.reshape(*shape, 4)
-    projected = ProjectedTransfer(grid, None, around[..., 0], around[..., 1:], scene.transfer, made_for)
-    projected = projected if transfer.scattering is None else scattered(scene, projected)
-    return projected if transfer.chromaticity is None else projected.separated(transfer.chromaticity)
+    projected = ProjectedRadianceTransfer(grid, None, around[..., 0], around[..., 1:], scene.transfer, cache_key)
+    projected = projected if radiance_transfer.scattering is None else scattered(scene, projected)
+    return projected if radiance_transfer.chromaticity is None else projected.separated(radiance_transfer.chromaticity)
 
 
-def scattered(scene: Scene, projected: ProjectedTransfer) -> ProjectedTransfer:
-    """The transfer after the scattering pass."""
+def scattered(scene: Scene, projected: ProjectedRadianceTransfer) -> ProjectedRadianceTransfer:
+    """The radiance transfer after the scattering pass."""
     from jvr.effects.diffusion import scatter
 
-    transfer = transfer_of(scene)
+    radiance_transfer = radiance_transfer_of(scene)
     there = projected.solid > 0
-    coefficients = scatter(transfer.scattering, transfer.neighbourhood, scene.volume, projected.coefficients, there)
+    coefficients = scatter(
+        radiance_transfer.scattering, radiance_transfer.neighbourhood, scene.volume, projected.coefficients, there
+    )
     return dataclasses.replace(projected, luminance=coefficients, chroma=None, scattered=True)
 
 
@@ -194,10 +198,10 @@ def _over_nodes(
     return over_rays(function, light, jax.tree.map(flat, grids))[: x * y * z].reshape(x, y, z, -1)
 
 
-def _shares(
+def _fractions(
     facing: Float[Array, "nodes 3"], coefficients: Float[Array, "nodes channels bands"], light: Float[Array, "others 3"]
 ) -> Float[Array, "nodes 3"]:
-    """The share of each colour of the light that arrives, of all that a matte surface would reflect that faces where the node does; 0
+    """The fraction of each colour of the light that arrives, of all that a diffuse surface would reflect that faces where the node does; 0
     where there is no light."""
     matrix = product_matrix(light, math.isqrt(coefficients.shape[-1]) - 1, 2)
     flat = [coefficients[:, c].T for c in range(coefficients.shape[1])]
@@ -206,21 +210,21 @@ def _shares(
     kernel = [1.0, *(length * k for k in (2 / 3, 1 / 4))]
     functions = [y * kernel[band] for y, band in zip(basis(2, normal), band_of(2), strict=True)]
     full = jnp.pad(light, ((0, max(9 - light.shape[0], 0)), (0, 0)))[:9]
-    found = []
+    fractions = []
     for colour in range(3):
         # Numbers of a node far from each other and those of all nodes side by side: one loop for all that follows.
-        arriving = matrix[..., colour] @ flat[colour % len(flat)]
-        own, whole = (sum(y * v[i] for i, y in enumerate(functions)) for v in (arriving, full[:, colour]))
-        # Where a surface faces no light the share is that of all light.
-        own, whole = (jnp.maximum(v, 0.0) + DARK * jnp.maximum(r[0], 0.0) for v, r in ((own, arriving), (whole, full[:, colour])))
-        found.append(divide_or_zero(own, whole))
-    return jnp.stack(found, axis=-1)
+        incident = matrix[..., colour] @ flat[colour % len(flat)]
+        own, whole = (sum(y * v[i] for i, y in enumerate(functions)) for v in (incident, full[:, colour]))
+        # Where a surface faces no light the fraction is that of all light.
+        own, whole = (jnp.maximum(v, 0.0) + DARK * jnp.maximum(r[0], 0.0) for v, r in ((own, incident), (whole, full[:, colour])))
+        fractions.append(divide_or_zero(own, whole))
+    return jnp.stack(fractions, axis=-1)
 
 
 def _products(
     coefficients: Float[Array, "nodes channels bands"], light: Float[Array, "others 3"], order: int
 ) -> Float[Array, "nodes products"]:
-    """Coefficients of light times transfer up to an order, all colours of each."""
+    """Coefficients of light times radiance transfer up to an order, all colours of each."""
     matrix = product_matrix(light, math.isqrt(coefficients.shape[-1]) - 1, order)
     kinds = "ncb,obc->noc" if coefficients.shape[1] == 3 else "ncb,obh->noh"
     products = jnp.einsum(kinds, coefficients, matrix)

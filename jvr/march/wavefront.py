@@ -1,4 +1,4 @@
-"""A loop over many rays in a pool of few lanes: a lane whose ray has finished takes the next ray from the queue."""
+"""A loop over many rays in a wavefront of few: where a ray has finished, the next one of the queue starts (ray regeneration)."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -12,20 +12,20 @@ State = TypeVar("State")
 Shared = TypeVar("Shared")
 Results = TypeVar("Results")
 
-# Lanes in the pool: enough to outweigh what it costs to start an operation, few enough for their state to stay in the cache.
-POOL = 3072
-# How many times as many lanes an accelerator keeps in flight: as many as a large one has threads. (Chosen, not measured.)
-WIDER = 64
-# The share of lanes that may idle before they are filled again.
+# Rays in flight: enough to outweigh what it costs to start an operation, few enough for their state to stay in the cache.
+WAVEFRONT = 3072
+# How many times as many an accelerator keeps in flight: as many as a large one has threads. (Chosen, not measured.)
+ON_ACCELERATORS = 64
+# The fraction of the wavefront that may idle before rays are regenerated.
 IDLE = 0.25
 # Neighbouring rays that are put in order together.
 TOGETHER = 16
-# Lanes of the smaller pool that the last rays end in, so that a few long ones do not pay for all the others' lanes.
+# Rays of the smaller wavefront that the last ones are compacted into, so that a few long ones do not pay for the width of all.
 TAIL = 512
 
 
-def pooled_while(
-    alive: Callable[[Inputs, State], Bool[Array, "lanes"]],
+def wavefront_while(
+    alive: Callable[[Inputs, State], Bool[Array, "active"]],
     advance: Callable[[Inputs, State, Shared], tuple[State, Shared]],
     start: Callable[[Inputs], State],
     finish: Callable[[State], Results],
@@ -33,24 +33,24 @@ def pooled_while(
     shared: Shared,
     work: Int[Array, "rays"],
 ) -> tuple[Results, Shared]:
-    """`while any(alive): advance` for every ray, of which at most `POOL` are in flight (more on accelerators).
+    """`while any(alive): advance` for every ray, of which at most `WAVEFRONT` are in flight (more on accelerators).
 
     `inputs` and what `finish` returns are pytrees of arrays with a leading axis of rays; `start` makes the state of a batch from its
-    inputs; `shared` is carried along. `advance` must leave a finished lane as it is. Rays with more `work` to do start first, so
+    inputs; `shared` is carried along. `advance` must leave a finished ray as it is. Rays with more `work` to do start first, so
     that no long ray is left alone at the end; rays without any are not started, and their results are zero. Results come in the
     order of `inputs`.
 
     Finished rays are thus not paid for, and memory in flight does not grow with the picture.
     """
-    pool, tail = (n if jax.default_backend() == "cpu" else WIDER * n for n in (POOL, TAIL))
-    if work.shape[0] <= pool:
+    width, tail = (n if jax.default_backend() == "cpu" else ON_ACCELERATORS * n for n in (WAVEFRONT, TAIL))
+    if work.shape[0] <= width:
         state, shared = jax.lax.while_loop(
             lambda carry: jnp.any(alive(inputs, carry[0])), lambda carry: advance(inputs, *carry), (start(inputs), shared)
         )
         return finish(state), shared
     queue, size = _longest_first(work)
     take = lambda index: jax.tree.map(lambda x: x[index], inputs)
-    index = queue[:pool]
+    index = queue[:width]
     own = take(index)
     state = start(own)
     results = jax.tree.map(lambda x: jnp.zeros((work.shape[0], *x.shape[1:]), x.dtype), jax.eval_shape(finish, state))
@@ -60,9 +60,9 @@ def pooled_while(
         own, state, _, _, following, _ = carry
         return (following < size) | (jnp.sum(alive(own, state)) > tail)
 
-    def drain_and_fill(carry):
+    def drain_and_regenerate(carry):
         own, state, shared, index, following, results = carry
-        enough = jnp.where(following < size, int(pool * (1 - IDLE)), tail)
+        enough = jnp.where(following < size, int(width * (1 - IDLE)), tail)
         state, shared = jax.lax.while_loop(
             lambda c: jnp.sum(alive(own, c[0])) > enough, lambda c: advance(own, *c), (state, shared)
         )
@@ -76,13 +76,13 @@ def pooled_while(
         following = jnp.minimum(following + jnp.sum(idle, dtype=jnp.int32), size)
         return own, state, shared, index, following, results
 
-    carry = (own, state, shared, index, jnp.int32(pool), results)
-    own, state, shared, index, _, results = jax.lax.while_loop(filling, drain_and_fill, carry)
-    # Lanes that are not alive are done and written; one of them fills up the smaller pool, and is written again. Where all are alive,
-    # in a pool no larger than the smaller one, none may be taken twice: what it adds to `shared` would count twice.
+    carry = (own, state, shared, index, jnp.int32(width), results)
+    own, state, shared, index, _, results = jax.lax.while_loop(filling, drain_and_regenerate, carry)
+    # Rays that are not alive are done and written; one of them fills up the smaller wavefront, and is written again. Where all are alive,
+    # in a wavefront no larger than the smaller one, none may be taken twice: what it adds to `shared` would count twice.
     living = alive(own, state)
-    lanes = jnp.nonzero(living, size=min(tail, pool), fill_value=jnp.argmin(living))[0]
-    index, state = index[lanes], jax.tree.map(lambda x: x[lanes], state)
+    compacted = jnp.nonzero(living, size=min(tail, width), fill_value=jnp.argmin(living))[0]
+    index, state = index[compacted], jax.tree.map(lambda x: x[compacted], state)
     own = take(index)
     state, shared = jax.lax.while_loop(lambda c: jnp.any(alive(own, c[0])), lambda c: advance(own, *c), (state, shared))
     return put(results, index, state), shared
@@ -103,5 +103,5 @@ def _longest_first(work: Int[Array, "rays"]) -> tuple[Int[Array, "queue"], Int[A
     return queue, busy
 
 
-def _where(mask: Bool[Array, "lanes"], new: Array, old: Array) -> Array:
+def _where(mask: Bool[Array, "active"], new: Array, old: Array) -> Array:
     return jnp.where(mask.reshape(-1, *(1,) * (old.ndim - 1)), new, old)

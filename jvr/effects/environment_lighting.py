@@ -1,4 +1,4 @@
-"""What a sample sends to the eye of light that comes from all around: the integral of material and light, both in spherical harmonics.
+"""Environment lighting of a sample: the integral of material times incident light, both in spherical harmonics.
 
 A material is even about the plane of normal `n` and eye. In this plane a band of the light with `2 l + 1` coefficients is known by its
 values in `l + 1` directions, and those are all that is needed of it:
@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.effects.own_shadow import OwnShadow, Segment, own_shadow_of
-from jvr.effects.shading import share_of
+from jvr.effects.self_shadow import SelfShadow, ShadedSegment, self_shadow_of
+from jvr.effects.shading import surface_weight
 from jvr.model.harmonics.basis import band_of, basis, count
-from jvr.model.material import About, HarmonicMaterial, Lobe
+from jvr.model.material import HarmonicMaterial, Lobe, SymmetryAxis
 from jvr.model.scene import Scene
 from jvr.numerics import clamp, direction_and_length, dot, larger
 from jvr.types import Channels, Scalar, Triple
@@ -32,25 +32,25 @@ class PlaneTable(eqx.Module):
 
     rows: Float[Array, "classes polar row"]
     shape: tuple[int, int, int] = eqx.field(static=True)
-    about: About = eqx.field(static=True)
+    symmetry_axis: SymmetryAxis = eqx.field(static=True)
 
     @classmethod
     def of(cls, lobe: Lobe, order: int) -> "PlaneTable":
         """The table of a lobe, up to an order."""
         rho = lobe.coefficients[:, :, : order + 1, : order + 1]
         bands = rho.shape[2]
-        if lobe.about == "both":
+        if lobe.symmetry_axis == "both":
             rho = jnp.einsum("cplmh,lmk->cplkh", rho, jnp.asarray(_in_plane(bands - 1), rho.dtype))
         else:
             # Y_l0 at its own pole.
             rho = rho / jnp.sqrt((2 * jnp.arange(bands, dtype=rho.dtype) + 1) / (4 * math.pi))[:, None, None]
         classes, polar, *shape = rho.shape
-        return cls(rho.reshape(classes, polar, -1), (shape[0], shape[1], shape[2]), lobe.about)
+        return cls(rho.reshape(classes, polar, -1), (shape[0], shape[1], shape[2]), lobe.symmetry_axis)
 
     def directions(self, normal: Triple, across: Triple, w_o: Triple) -> list[Triple]:
         """Where the light is looked at."""
-        if self.about != "both":
-            return [normal if self.about == "normal" else w_o]
+        if self.symmetry_axis != "both":
+            return [normal if self.symmetry_axis == "normal" else w_o]
         angles = [k * math.pi / self.shape[1] for k in range(self.shape[1])]
         return [tuple(math.cos(a) * n + math.sin(a) * t for n, t in zip(normal, across, strict=True)) for a in angles]
 
@@ -66,27 +66,27 @@ class PlaneTable(eqx.Module):
         return jnp.asarray(row).reshape(self.shape)
 
 
-def _between(low: Array, share: Scalar) -> list[tuple[Any, Any]]:
+def _between(low: Array, fraction: Scalar) -> list[tuple[Any, Any]]:
     """An entry and the next, with their weights."""
-    return [(low, 1 - share), (low + 1, share)]
+    return [(low, 1 - fraction), (low + 1, fraction)]
 
 
-class NaturalLight(eqx.Module):
-    """A material under light from all around. `light`: its coefficients, of which a sample may bring the share that arrives, one or for
+class EnvironmentLighting(eqx.Module):
+    """A material under environment lighting. `light`: its coefficients, of which a sample may bring the fraction that arrives, one or for
     each colour; or `None` where each sample brings the coefficients of what arrives, all colours of the first, then of the next."""
 
     light: Float[Array, "bands 3"] | None
     tinted: PlaneTable | None
-    plain: PlaneTable | None
+    unmodulated: PlaneTable | None
     positions: Float[Array, "classes"]
     threshold: Scalar
     clamped: bool = eqx.field(static=True)
-    shadow: OwnShadow | None = None
+    shadow: SelfShadow | None = None
 
     @property
     def needs_gradient(self) -> bool:
         """Whether what is reflected depends on a normal."""
-        return any(table is not None and table.about != "eye" for table in (self.tinted, self.plain))
+        return any(table is not None and table.symmetry_axis != "eye" for table in (self.tinted, self.unmodulated))
 
     def reflect(
         self,
@@ -94,20 +94,20 @@ class NaturalLight(eqx.Module):
         magnitude: Scalar,
         normal: Triple,
         w_o: Triple,
-        arriving: Channels,
+        incident: Channels,
         cut: Scalar | float = 0.0,
-        here: Segment | None = None,
+        here: ShadedSegment | None = None,
     ) -> tuple[Triple, Triple]:
         """What the colour of the medium is multiplied with, and what is added to that in the light's own colour.
 
-        `arriving`: of the environment, and where surfaces shadow themselves, how much of one there is; `here`: the segment, then.
-        `magnitude`: length of the gradient. Where it is weak, bands of the light above the first count less, but for the share of a point
-        that is a `cut`. The normal is turned to the eye.
+        `incident`: of the environment, and where surfaces shadow themselves, how much of one there is; `here`: the segment, then.
+        `magnitude`: length of the gradient. Where it is weak, bands of the light above the first count less, but for the fraction of a
+        point that is a `cut`. The normal is turned to the eye.
         """
-        zero, surface = jnp.zeros_like(s), share_of(magnitude, self.threshold)
+        zero, surface = jnp.zeros_like(s), surface_weight(magnitude, self.threshold)
         surface = surface + cut * (1 - surface)
-        arriving, solid = (arriving, zero) if self.shadow is None else (arriving[:-1], arriving[-1])
-        coefficients, share = self._light(arriving, s)
+        incident, solid = (incident, zero) if self.shadow is None else (incident[:-1], incident[-1])
+        coefficients, fraction = self._light(incident, s)
         turn = jnp.where(dot(normal, w_o) < 0, -1.0, 1.0)
         normal = tuple(turn * c for c in normal)
         cosine = dot(normal, w_o)
@@ -121,23 +121,23 @@ class NaturalLight(eqx.Module):
             assert here is not None
             kept = self.shadow.remaining(s, magnitude, normal, w_o, here, solid)
         parts = []
-        for table in (self.tinted, self.plain):
+        for table in (self.tinted, self.unmodulated):
             if table is None:
                 parts.append((zero,) * 3)
                 continue
-            counts = zero + 1 if table.about == "eye" else surface
+            counts = zero + 1 if table.symmetry_axis == "eye" else surface
             scales = [kept[0], *(tuple(counts * k for k in band) for band in kept[1:])]
             radiance = _integrate(table.at(place, theta), coefficients, table.directions(normal, across, w_o), scales)
-            radiance = tuple(c * r for c, r in zip(share, radiance, strict=True))
+            radiance = tuple(c * r for c, r in zip(fraction, radiance, strict=True))
             parts.append(tuple(larger(r, 0.0) for r in radiance) if self.clamped else radiance)
         return parts[0], parts[1]
 
-    def _light(self, arriving: Channels, s: Scalar) -> tuple[list[Triple], Triple]:
-        """Coefficients of the light at a sample, and what share of it arrives."""
+    def _light(self, incident: Channels, s: Scalar) -> tuple[list[Triple], Triple]:
+        """Coefficients of the light at a sample, and what fraction of it arrives."""
         one = jnp.ones_like(s)
         if self.light is None:
-            return [arriving[i : i + 3] for i in range(0, len(arriving), 3)], (one, one, one)
-        return [(row[0], row[1], row[2]) for row in self.light], arriving * (3 // len(arriving)) if arriving else (one,) * 3
+            return [incident[i : i + 3] for i in range(0, len(incident), 3)], (one, one, one)
+        return [(row[0], row[1], row[2]) for row in self.light], incident * (3 // len(incident)) if incident else (one,) * 3
 
     def _class(self, s: Scalar) -> tuple[Array, Scalar]:
         """The class before a scalar, and the fraction of the way to the next."""
@@ -148,19 +148,25 @@ class NaturalLight(eqx.Module):
         return low.astype(jnp.int32), place - low
 
 
-def natural_light(
+def environment_lighting(
     material: HarmonicMaterial,
     light: Float[Array, "bands 3"],
     *,
     clamped: bool,
     order: int,
     from_samples: bool,
-    shadow: OwnShadow | None = None,
-) -> NaturalLight:
-    """`NaturalLight` up to an order; `from_samples`: each sample brings the coefficients of its light."""
-    tinted, plain = (None if lobe is None else PlaneTable.of(lobe, order) for lobe in (material.tinted, material.plain))
-    return NaturalLight(
-        None if from_samples else light[: count(order)], tinted, plain, material.positions, material.threshold, clamped, shadow
+    shadow: SelfShadow | None = None,
+) -> EnvironmentLighting:
+    """`EnvironmentLighting` up to an order; `from_samples`: each sample brings the coefficients of its light."""
+    tinted, unmodulated = (None if lobe is None else PlaneTable.of(lobe, order) for lobe in (material.tinted, material.plain))
+    return EnvironmentLighting(
+        None if from_samples else light[: count(order)],
+        tinted,
+        unmodulated,
+        material.positions,
+        material.threshold,
+        clamped,
+        shadow,
     )
 
 
@@ -195,7 +201,7 @@ def _in_plane(order: int) -> np.ndarray:
     return result
 
 
-def natural_light_of(scene: Scene) -> NaturalLight:
+def environment_lighting_of(scene: Scene) -> EnvironmentLighting:
     """A scene's material under its environment. Where samples bring the coefficients of what arrives, those of a product, the order is
     that of the material, else also that of the light."""
     environment = scene.environment
@@ -204,16 +210,16 @@ def natural_light_of(scene: Scene) -> NaturalLight:
     material: HarmonicMaterial = scene.material.projected(scene.material_order)
     exact = scene.radiance_transfer is not None and scene.radiance_transfer.exact
     order = material.order if exact else min(material.order, environment.order)
-    shadow = own_shadow_of(scene, albedo_of(scene))
-    return natural_light(
+    shadow = self_shadow_of(scene, albedo_of(scene))
+    return environment_lighting(
         material, environment.coefficients, clamped=environment.clamped, order=order, from_samples=exact, shadow=shadow
     )
 
 
-def albedo_of(scene: Scene) -> NaturalLight | None:
+def albedo_of(scene: Scene) -> EnvironmentLighting | None:
     """A scene's material under light of one from everywhere, where rays of its radiance transfer pick up what it reflects."""
     if scene.radiance_transfer is None or not scene.radiance_transfer.needs_gradient:
         return None
     assert scene.material is not None
     everywhere = jnp.full((1, 3), math.sqrt(4 * math.pi), scene.volume.slope.dtype)
-    return natural_light(scene.material.projected(0), everywhere, clamped=True, order=0, from_samples=False)
+    return environment_lighting(scene.material.projected(0), everywhere, clamped=True, order=0, from_samples=False)

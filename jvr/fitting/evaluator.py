@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.execution.devices import on_devices
-from jvr.fitting.identifiability import Determination, determination
+from jvr.fitting.identifiability import Identifiability, identifiability
 from jvr.fitting.losses import DSSIM, SquaredError
 from jvr.fitting.objective import (
     Normal,
     Problem,
     image_value,
+    light_tangents,
     normal_equations,
-    prepared,
     prior_expansion,
     residuals,
     value,
@@ -40,11 +40,11 @@ class ValueFunction(eqx.Module):
     """The objective as Optimistix calls it."""
 
     problem: Problem
-    pieces: Observations
+    tiles: Observations
     total: Scalar
 
-    def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Scalar, None]:
-        return value(self.problem, real, self.pieces, self.total), None
+    def __call__(self, unconstrained: Float[Array, "unknowns"], args: None) -> tuple[Scalar, None]:
+        return value(self.problem, unconstrained, self.tiles, self.total), None
 
 
 class ImageValueFunction(eqx.Module):
@@ -54,22 +54,22 @@ class ImageValueFunction(eqx.Module):
     cameras: tuple[AbstractCamera, ...]
     images: tuple[Array, ...]
 
-    def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Scalar, None]:
-        return image_value(self.problem, real, self.cameras, self.images), None
+    def __call__(self, unconstrained: Float[Array, "unknowns"], args: None) -> tuple[Scalar, None]:
+        return image_value(self.problem, unconstrained, self.cameras, self.images), None
 
 
 class ResidualFunction(eqx.Module):
     """`residuals` as Optimistix calls them."""
 
     problem: Problem
-    pieces: Observations
+    tiles: Observations
     total: Scalar
 
-    def __call__(self, real: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
-        return residuals(self.problem, real, self.pieces, self.total), None
+    def __call__(self, unconstrained: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
+        return residuals(self.problem, unconstrained, self.tiles, self.total), None
 
 
-class Work:
+class Evaluator:
     """A problem and its observations, ready for a solver; everything that is large lives here once."""
 
     def __init__(self, problem: Problem, observations: Observations, chunk: int, cameras: Sequence[AbstractCamera], images: Any):
@@ -78,12 +78,12 @@ class Work:
         self.rays = observations.size
         self.total = _total(observations)
         self.levels = _levels(problem, observations, chunk)
-        self.pieces = jax.tree.map(lambda x: on_devices(x.reshape(-1, chunk, *x.shape[1:])), observations)
+        self.tiles = jax.tree.map(lambda x: on_devices(x.reshape(-1, chunk, *x.shape[1:])), observations)
         self.functions = self._functions(tuple(cameras), tuple(jnp.asarray(image) for image in images))
 
-    def expand(self, level: int, real: Float[Array, "unknowns"]) -> tuple[float, Normal]:
-        """The objective at `real`, over the rays of a level, and the normal equations in the unknowns' own values."""
-        values = self.problem.unknowns.values_from_real(jnp.asarray(real), self.problem.model)
+    def expand(self, level: int, unconstrained: Float[Array, "unknowns"]) -> tuple[float, Normal]:
+        """The objective at `unconstrained`, over the rays of a level, and the normal equations in the unknowns' own values."""
+        values = self.problem.unknowns.values_from_unconstrained(jnp.asarray(unconstrained), self.problem.model)
         observations = self.levels[level]
         normal = self._sum(values, observations)
         total = _total(observations)
@@ -92,20 +92,22 @@ class Work:
         normal = jax.tree.map(lambda x: x / total, normal)
         return float(normal.loss) + float(prior), normal
 
-    def quadratic(self, real: np.ndarray, normal: Normal) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient and Gauss-Newton matrix of the objective on the real line."""
+    def quadratic(self, unconstrained: np.ndarray, normal: Normal) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient and Gauss-Newton matrix of the objective in unconstrained space."""
         unknowns, model = self.problem.unknowns, self.problem.model
         gradient, matrix = 2 * normal.vector, 2 * normal.matrix
         if self.problem.priors:
-            _, prior_gradient, prior_matrix = prior_expansion(self.problem, unknowns.values_from_real(jnp.asarray(real), model))
+            _, prior_gradient, prior_matrix = prior_expansion(
+                self.problem, unknowns.values_from_unconstrained(jnp.asarray(unconstrained), model)
+            )
             gradient = gradient + np.asarray(prior_gradient, np.float64)
             matrix = matrix + np.asarray(prior_matrix, np.float64)
-        slope = np.asarray(_slope(unknowns, model, jnp.asarray(real)), np.float64)
+        slope = np.asarray(_slope(unknowns, model, jnp.asarray(unconstrained)), np.float64)
         return slope.T @ gradient, slope.T @ matrix @ slope
 
-    def limits(self, real: np.ndarray) -> Limits:
-        """Where the unknowns may go from a point on the real line."""
-        return Limits(*self.problem.unknowns.limits(self.problem.model, real))
+    def limits(self, unconstrained: np.ndarray) -> Limits:
+        """Where the unknowns may go from a point of unconstrained space."""
+        return Limits(*self.problem.unknowns.limits(self.problem.model, unconstrained))
 
     def _rounding(self) -> float:
         """The mean squared error of pictures that differ by the rounding of sums along rays alone."""
@@ -113,7 +115,7 @@ class Work:
         mean = float(jnp.sum(weight[:, None] * jnp.square(targets))) / self.total
         return (ROUNDING * float(jnp.finfo(targets.dtype).eps)) ** 2 * mean
 
-    def determination(self, values: Float[Array, "unknowns"]) -> Determination:
+    def identifiability(self, values: Float[Array, "unknowns"]) -> Identifiability:
         """Standard errors at the solution, over all rays."""
         problem = self.problem
         if isinstance(problem.loss, DSSIM):
@@ -122,7 +124,7 @@ class Work:
         normal = self._sum(values, self.levels[-1], problem)
         matrix = normal.matrix + self._gauge(values, np.diag(normal.matrix))
         measurements = 3 * int(jnp.sum(self.levels[-1].weight > 0))
-        return determination(matrix, float(normal.squares), measurements, float(jnp.finfo(values.dtype).eps))
+        return identifiability(matrix, float(normal.squares), measurements, float(jnp.finfo(values.dtype).eps))
 
     def _gauge(self, values: Float[Array, "unknowns"], diagonal: np.ndarray) -> np.ndarray:
         """What fixes the length of directions: it is 1 by convention, and no image says anything about it."""
@@ -134,7 +136,7 @@ class Work:
             begin += part.size
         return fixed
 
-    def psnr(self, real: np.ndarray, loss: float, normal: Normal | None) -> float:
+    def psnr(self, unconstrained: np.ndarray, loss: float, normal: Normal | None) -> float:
         """Decibels relative to radiance 1. Where neither the objective nor what a solver knows is the mean squared error, that costs
         a march of its own."""
         if normal is not None:
@@ -142,22 +144,24 @@ class Work:
         elif isinstance(self.problem.loss, SquaredError) and not self.problem.priors:
             mean = loss
         else:
-            mean = float(_mean_squares(self.problem.least_squares(), jnp.asarray(real), self.pieces, jnp.asarray(self.total)))
+            mean = float(
+                _mean_squares(self.problem.least_squares(), jnp.asarray(unconstrained), self.tiles, jnp.asarray(self.total))
+            )
         return float(-10 * np.log10(max(mean, 1e-20)))
 
     def _sum(self, values: Float[Array, "unknowns"], observations: Observations, problem: Problem | None = None) -> Normal:
         """The normal equations of all chunks together, in float64."""
         problem = problem or self.problem
-        around = prepared(problem, values)
-        parts = [normal_equations(problem, values, piece, around) for piece in observations.pieces(self.chunk)]
+        around = light_tangents(problem, values)
+        parts = [normal_equations(problem, values, tile, around) for tile in observations.tiles(self.chunk)]
         return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
 
     def _functions(self, cameras: tuple[AbstractCamera, ...], images: tuple[Array, ...]) -> Functions:
         if isinstance(self.problem.loss, DSSIM):
             function = ImageValueFunction(self.problem, cameras, images)
         else:
-            function = ValueFunction(self.problem, self.pieces, jnp.asarray(self.total))
-        residuals = ResidualFunction(self.problem, self.pieces, jnp.asarray(self.total))
+            function = ValueFunction(self.problem, self.tiles, jnp.asarray(self.total))
+        residuals = ResidualFunction(self.problem, self.tiles, jnp.asarray(self.total))
         levels = tuple(functools.partial(self.expand, i) for i in range(len(self.levels)))
         return Functions(function, residuals, levels, self.limits, self.quadratic, self._rounding())
 
@@ -171,12 +175,12 @@ def _levels(problem: Problem, observations: Observations, chunk: int) -> tuple[O
     """All observations, after a subset that still over-determines the unknowns where that is much smaller."""
     unknowns = sum(v.size for v in problem.unknowns.values(problem.model))
     every = min(MOST_THINNING, 3 * observations.size // max(LEAST_RESIDUALS * unknowns, chunk))
-    return (observations,) if every < 2 else (observations.thinned(every, chunk), observations)
+    return (observations,) if every < 2 else (observations.subsampled(every, chunk), observations)
 
 
 _mean_squares = eqx.filter_jit(value)
 
 
 @eqx.filter_jit
-def _slope(unknowns: Any, model: Any, real: Array) -> Array:
-    return jax.jacfwd(lambda r: unknowns.values_from_real(r, model))(real)
+def _slope(unknowns: Any, model: Any, unconstrained: Array) -> Array:
+    return jax.jacfwd(lambda r: unknowns.values_from_unconstrained(r, model))(unconstrained)
