@@ -195,6 +195,15 @@ def test_a_scene_in_double_precision_comes_back_to_the_last_bit(tmp_path, x64, n
     check_same(again(expected, tmp_path), expected)
 
 
+@pytest.mark.parametrize("name", ["lights", "float16, NaN", "in the world"])
+def test_a_scene_in_single_precision_is_the_same_where_double_is_enabled(tmp_path, name):
+    """What a constructor computes, as of voxels beside gaps, is not what it computes there."""
+    expected = example(name)
+    jvr.save_scene(expected, tmp_path / "a.toml")
+    with jax.enable_x64(True):
+        check_same(jvr.load_scene(tmp_path / "a.toml"), expected)
+
+
 def public_parts() -> set[str]:
     """The public names of classes that can be somewhere in a scene, found by what fields take."""
     public = {name: getattr(jvr, name) for names in NAMES.values() for name in names if name[0].isupper()}
@@ -369,6 +378,16 @@ def test_numbers_and_kinds_can_be_edited(files):
     found = jvr.load_scene(files).scattering
     np.testing.assert_array_equal(found.albedo, np.float32([0.25, 0.5, 1]))
     np.testing.assert_array_equal(found.phase.phases[3].k.values, np.float32([0.1, 0.2]))
+
+
+def test_the_example_of_the_documentation_is_valid(tmp_path):
+    text = (Path(__file__).parents[1] / "docs" / "files.md").read_text(encoding="utf-8")
+    (example,) = (block for block in text.split("```toml\n") if 'kind = "LinearTransfer"' in block)
+    jvr.save_scene(lit(), tmp_path / "a.toml")
+    edit(tmp_path / "a.toml", r"^\[transfer\](.|\n)*?\n\n", example.split("```")[0] + "\n")
+    found = jvr.load_scene(tmp_path / "a.toml")
+    np.testing.assert_array_equal(found.transfer.positions, [0, 300])
+    assert found.shadows == jvr.ShadowRays()
 
 
 def test_what_is_left_out_has_the_default_of_its_class(files):
