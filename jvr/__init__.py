@@ -3,6 +3,8 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from jvr.names import NAMES
+
 if TYPE_CHECKING:
     from jvr.effects.deep_shadow_map import DeepShadowMap as DeepShadowMap
     from jvr.effects.radiance_transfer import MaterialBleeding as MaterialBleeding
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
     from jvr.fitting.residuals import residuals as residuals
     from jvr.io.images import read_image as read_image
     from jvr.io.precompute import precompute as precompute
+    from jvr.io.scenes import load_scene as load_scene
+    from jvr.io.scenes import save_scene as save_scene
     from jvr.io.volumes import read_volume as read_volume
     from jvr.march.differentiation import Forward as Forward
     from jvr.march.differentiation import Replay as Replay
@@ -127,70 +131,7 @@ __version__ = "0.1.0"
 # Everything is imported by its first use: JAX alone takes a second, fitting another, and a scene needs few of the effects. So the command
 # line answers a wrong flag at once, and no moment of its start is outside of what catches Ctrl-C.
 _MODULES = {"harmonics": "jvr.model.harmonics", "presets": "jvr.model.presets", "sh": "jvr.model.harmonics"}
-_NAMES = {
-    "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
-    "jvr.effects.radiance_transfer": ("MaterialBleeding", "RadianceTransfer", "TransferBleeding"),
-    "jvr.effects.scattering": ("SingleScattering",),
-    "jvr.effects.shading": ("BlinnPhong", "Lambert", "Phong"),
-    "jvr.effects.shadow_map": ("ShadowMap",),
-    "jvr.effects.shadow_rays": ("ShadowRays",),
-    "jvr.effects.shadow_volume": ("OpacityShadowMap", "ShadowVolume"),
-    "jvr.execution.devices": ("use_all_cores",),
-    "jvr.fitting.fit": ("FitResult", "fit"),
-    "jvr.fitting.initialise": ("colours_given_extinction", "flat_transfer"),
-    "jvr.fitting.least_squares": ("Dogleg", "GaussNewton", "LevenbergMarquardt"),
-    "jvr.fitting.losses": (
-        "AbsoluteError",
-        "ColourSmoothness",
-        "DSSIM",
-        "ExtinctionSmoothness",
-        "Huber",
-        "Sparsity",
-        "SquaredError",
-    ),
-    "jvr.fitting.minimisers": ("LBFGSB",),
-    "jvr.fitting.residuals": ("residuals",),
-    "jvr.fitting.bijectors": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
-    "jvr.io.images": ("read_image",),
-    "jvr.io.precompute": ("precompute",),
-    "jvr.io.volumes": ("read_volume",),
-    "jvr.march.differentiation": ("Forward", "Replay", "Rows"),
-    "jvr.march.oracle": ("BrickRange", "Finest", "LocalError", "OpacityChange"),
-    "jvr.march.quadrature": ("Midpoint", "PreIntegrated"),
-    "jvr.model.brdf": ("BlinnPhongBRDF", "LambertBRDF", "PhaseBRDF", "PhongBRDF"),
-    "jvr.model.by_value": ("ByValue",),
-    "jvr.model.camera": ("OrthographicCamera", "PerspectiveCamera", "fibonacci_sphere", "orbit"),
-    "jvr.model.dipole": ("Dipole",),
-    "jvr.model.environment": ("EnvironmentLight",),
-    "jvr.model.gradient_transfer": ("GradientOpacity", "GradientTransfer"),
-    "jvr.model.light": ("AmbientLight", "DirectionalLight", "HeadLight", "PointLight", "SpotLight", "disc_light", "sphere_light"),
-    "jvr.model.material": ("HarmonicMaterial", "MaterialByValue"),
-    "jvr.model.merl": ("MerlBRDF",),
-    "jvr.model.microfacet": ("MicrofacetBRDF",),
-    "jvr.model.mie": ("Draine", "JendersieEon", "TabulatedPhase"),
-    "jvr.model.normals": (
-        "AnalyticGradient",
-        "CentralDifferences",
-        "ForwardDifferences",
-        "PrecomputedGradient",
-        "SobelDifferences",
-    ),
-    "jvr.model.optical": ("AbsorptionOnly", "EmissionAbsorption", "EmissionOnly"),
-    "jvr.model.phase": ("DoubleHenyeyGreenstein", "HenyeyGreenstein", "Isotropic", "Mixture", "Rayleigh", "Schlick"),
-    "jvr.model.scene": ("Scene",),
-    "jvr.model.transfer": ("GaussianTransfer", "LinearTransfer", "LutTransfer"),
-    "jvr.model.volume": ("ClippingBox", "Nearest", "Trilinear", "Volume"),
-    "jvr.pictures": ("linear_from_srgb", "srgb_from_linear", "write_image"),
-    "jvr.rendering.advise": ("Advice", "advise"),
-    "jvr.rendering.image": ("RenderStats", "Rendering", "render"),
-    "jvr.rendering.measure": ("Measurement", "measure"),
-    "jvr.rendering.plan": ("plan",),
-    "jvr.rendering.sampling": ("Refinement", "Slices", "Uniform"),
-    "jvr.rendering.settings": ("Settings",),
-    "jvr.rendering.tune": ("Tuned", "tune"),
-    "jvr.types": ("Outcome",),
-}
-_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
+_MODULE_OF = {name: module for module, names in NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:

@@ -3,6 +3,7 @@
 import contextlib
 import glob
 import os
+import shutil
 import time
 import uuid
 from collections.abc import Iterator
@@ -43,6 +44,37 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
         _unfinished.discard(temporary)
+
+
+@contextlib.contextmanager
+def replacing_together(*paths: str | os.PathLike) -> Iterator[tuple[Path, ...]]:
+    """As `replacing` for files that belong together: all take their names, or each that was there stays."""
+    with contextlib.ExitStack() as before, contextlib.ExitStack() as files:
+        yield tuple(files.enter_context(replacing(path)) for path in paths)
+        for path in paths:
+            before.enter_context(_or_as_before(Path(os.path.realpath(path))))
+
+
+@contextlib.contextmanager
+def _or_as_before(path: Path) -> Iterator[None]:
+    """Where the block fails, the file at `path` is the one that was there, or none."""
+    old = path.with_name(f".{path.name[:80]}.{uuid.uuid4().hex[:8]}.part")
+    if path.is_file():
+        try:
+            os.link(path, old)
+        # Not every file system knows a second name for a file.
+        except OSError:
+            shutil.copy2(path, old)
+    try:
+        yield
+    except BaseException:
+        if old.exists():
+            os.replace(old, path)
+        elif path.is_file():
+            path.unlink()
+        raise
+    finally:
+        old.unlink(missing_ok=True)
 
 
 def remove_unfinished() -> None:

@@ -356,7 +356,7 @@ def test_a_lit_configuration_renders():
 @pytest.mark.slow
 def test_the_examples_of_the_documentation_are_valid():
     text = (Path(__file__).parents[1] / "docs" / "files.md").read_text(encoding="utf-8")
-    lit, fit = (block.split("```")[0] for block in text.split("```toml\n")[1:])
+    lit, fit, *_ = (block.split("```")[0] for block in text.split("```toml\n")[1:])
     scene = scene_of(BASE + lit)
     assert len(scene.lights) == 17
     fitted = config(

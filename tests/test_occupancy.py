@@ -20,7 +20,7 @@ SHAPES = [(9, 9, 9), (13, 6, 17), (1, 12, 10), (2, 3, 5), (1, 1, 1)]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("size", [1, 3, 4])
+@pytest.mark.parametrize("size", [1, 3, 4, 10**9])
 def test_bricks_bound_the_voxels_around_each_of_their_points(shape, size):
     values = np.random.default_rng(0).integers(-50, 50, shape, dtype=np.int16)
     bricks = bricks_of(jnp.asarray(values), size)

@@ -15,6 +15,7 @@ import jvr
 PACKAGE = Path(jvr.__file__).parent
 # A module imports from modules before it.
 ORDER = (
+    "names",
     "types",
     "numerics",
     "execution",

@@ -47,4 +47,5 @@ def _along(values: Array, axis: int, size: int, extreme: Any) -> Array:
         some = jax.lax.slice_in_dim(some, 0, min(count, some.shape[axis]), axis=axis)
         return jnp.concatenate([some, *[last] * (count - some.shape[axis])], axis=axis)
 
-    return functools.reduce(extreme, [voxel(i) for i in range(size + 1)])
+    # A run that is longer than the axis holds nothing else.
+    return functools.reduce(extreme, [voxel(i) for i in range(min(size, n - 1) + 1)])

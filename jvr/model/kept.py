@@ -35,6 +35,12 @@ def is_made_of(derived: Array, *sources: Array) -> bool:
     return len(noted) == 1 + len(sources) and all(ref() is x for ref, x in zip(noted, (derived, *sources), strict=True))
 
 
+def made_by(method: str) -> dict[str, str]:
+    """The metadata of a field that a method makes of the others: `eqx.field(metadata=made_by("bricked"))`. What is static in the field's
+    value are the arguments of the method."""
+    return {"made_by": method}
+
+
 _checksums: dict[int, tuple[weakref.ref, np.ndarray]] = {}
 
 

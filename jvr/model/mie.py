@@ -1,6 +1,7 @@
 """Phase functions of particles about as large as the wavelength or larger: Draine's, a fit to Mie theory, tables."""
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -38,7 +39,7 @@ class Draine(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    g: Numbers = eqx.field(metadata=within(ASYMMETRY))
+    g: Any = eqx.field(metadata=within(ASYMMETRY))
     alpha: Numbers = eqx.field(metadata=within(NOT_NEGATIVE))
 
     def __init__(self, g: ArrayLike | ByValue, alpha: ArrayLike):

@@ -155,7 +155,7 @@ class HenyeyGreenstein(AbstractPhase):
     **Arguments:** `g`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either; differentiable. **Raises** `ValueError` otherwise.
     """
 
-    g: Numbers = eqx.field(metadata=within(ASYMMETRY))
+    g: Any = eqx.field(metadata=within(ASYMMETRY))
 
     def __init__(self, g: ArrayLike | ByValue):
         self.g = asymmetry(g, "g")
@@ -178,8 +178,8 @@ class DoubleHenyeyGreenstein(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    g1: Numbers = eqx.field(metadata=within(ASYMMETRY))
-    g2: Numbers = eqx.field(metadata=within(ASYMMETRY))
+    g1: Any = eqx.field(metadata=within(ASYMMETRY))
+    g2: Any = eqx.field(metadata=within(ASYMMETRY))
     weight: Numbers = eqx.field(metadata=within(UNIT_INTERVAL))
 
     def __init__(self, g1: ArrayLike | ByValue, g2: ArrayLike | ByValue, weight: ArrayLike):
@@ -216,7 +216,7 @@ class Schlick(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    k: Numbers = eqx.field(metadata=within(ASYMMETRY))
+    k: Any = eqx.field(metadata=within(ASYMMETRY))
 
     def __init__(self, k: ArrayLike | ByValue):
         self.k = asymmetry(k, "k")

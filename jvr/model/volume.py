@@ -16,7 +16,7 @@ from jvr.execution.devices import spread
 from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder
-from jvr.model.kept import is_made_of, note_sources
+from jvr.model.kept import is_made_of, made_by, note_sources
 from jvr.model.packing import Squares, squares_of
 from jvr.model.voxels import CELL, VOXEL, as_missing, in_memory, masked_voxels, typical_range, without_gaps
 from jvr.numerics import add_runs, read_at, read_run, transformed, turned
@@ -114,9 +114,9 @@ class Volume(eqx.Module):
     slope: Scalar
     intercept: Scalar
     interpolation: AbstractInterpolation
-    bricks: Bricks | None = eqx.field(init=False)
-    squares: Squares | None = eqx.field(init=False)
-    gradients: Float[Array, "x y z 3"] | None = eqx.field(init=False)
+    bricks: Bricks | None = eqx.field(init=False, metadata=made_by("bricked"))
+    squares: Squares | None = eqx.field(init=False, metadata=made_by("packed"))
+    gradients: Float[Array, "x y z 3"] | None = eqx.field(init=False, metadata=made_by("graded"))
     gaps: UInt8[Array, "x y z"] | None
     remainder: Remainder
     unit: str = eqx.field(static=True)

@@ -4,9 +4,9 @@
 with what came out.
 
 The memory that a file may take is four times what it announces and `REST`. It announces what its reader hands to `check_size` or
-`check_pixels` and these let pass, and at least what it takes on disk: no more, where a reader allocates without having asked. The highest use counts from what the process has
-before the file, with all libraries and behind a whole file of the format. A process that a reader starts is not measured: it has limits of
-its own (`jvr/io/volumes/decode.py`).
+`check_pixels` and these let pass, and at least what it takes on disk: no more, where a reader allocates without having asked. The
+highest use counts from what the process has before the file, with all libraries and behind a whole file of the format. A process that a
+reader starts is not measured: it has limits of its own (`jvr/io/volumes/decode.py`).
 
 With JVR_FUZZ_SHAPE=160,150,64 the whole files show what a byte of voxels takes, beside which `REST` is small.
 """

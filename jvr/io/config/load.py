@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from jvr.io.config.errors import ConfigError, did_you_mean, first_complaint
 from jvr.io.config.schema.whole import ConfigTable
+from jvr.io.config.text import read_toml
 
 Override = tuple[str, Any]
 # Tables whose values may be others where a fit starts.
@@ -68,12 +69,9 @@ def read_config(path: str | os.PathLike, overrides: Sequence[str] = ()) -> Confi
     if not path.exists():
         near = did_you_mean(path.name, [p.name for p in path.parent.glob("*.toml")]) if path.parent.is_dir() else ""
         raise ConfigError(str(path), "", "no such file" + (f"; {near}" if near.startswith("did") else ""))
-    try:
-        text = path.read_text(encoding="utf-8")
-        data = tomllib.loads(text)
-    # Numbers of thousands of digits and thousands of nested brackets raise errors of their own.
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(str(path), "", f"not valid TOML: {error}") from None
+    text, data = read_toml(path)
+    if {"format", "checksum"} <= set(data):
+        raise ConfigError(str(path), "", "this is a scene, which jvr.load_scene reads in Python, and no configuration")
     return dataclasses.replace(config_from(data, str(path), path.parent, overrides), text=text)
 
 

@@ -1,9 +1,6 @@
 """Transfer functions in TOML: as a table of a configuration, and as a file of their own that a fit writes."""
 
 import os
-import tomllib
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -24,6 +21,7 @@ from jvr.io.config.schema.transfer import (
     TransferTable,
     WindowTable,
 )
+from jvr.io.config.text import array_text, read_toml
 from jvr.model import presets
 from jvr.model.gradient_transfer import GradientOpacity, GradientTransfer
 from jvr.model.transfer import AbstractTransfer, GaussianTransfer, LinearTransfer, LutTransfer
@@ -52,12 +50,12 @@ def write_transfer(path: str | os.PathLike, transfer: AbstractTransfer) -> None:
     """
     lines = []
     if isinstance(transfer, GradientOpacity):
-        bounds = (f"{name} = {_digits(np.asarray(getattr(transfer, name))[()])}" for name in ("low", "high"))
+        bounds = (f"{name} = {array_text(np.asarray(getattr(transfer, name)))}" for name in ("low", "high"))
         lines, transfer = [f"gradient_opacity = {{ {', '.join(bounds)} }}\n"], transfer.transfer
     if type(transfer) not in FIELDS:
         raise TypeError(f"{type(transfer).__name__} cannot be written as TOML")
     kind, names = FIELDS[type(transfer)]
-    lines += [f"{name} = {_toml(np.asarray(getattr(transfer, name)))}\n" for name in names]
+    lines += [f"{name} = {array_text(np.asarray(getattr(transfer, name)))}\n" for name in names]
     with replacing(path) as temporary:
         temporary.write_text("".join([HEADER, f'kind = "{kind}"\n', *lines]), encoding="utf-8")
 
@@ -67,12 +65,7 @@ def read_transfer(path: str | os.PathLike) -> AbstractTransfer:
 
     **Raises** `ConfigError` for anything else, `OSError` where the file cannot be read.
     """
-    name = str(path)
-    try:
-        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    # Numbers of thousands of digits and thousands of nested brackets raise errors of their own.
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(name, "", f"not valid TOML: {error}") from None
+    name, (_, data) = str(path), read_toml(path)
     try:
         table = TypeAdapter(TransferTable).validate_python(data)
     except ValidationError as error:
@@ -125,18 +118,6 @@ def _preset(table: PresetTable, volume: Volume | None) -> AbstractTransfer:
         return preset(int(volume.data().max()), sigma_t=LABEL_DEPTH / spacing if table.sigma_t is None else table.sigma_t)
     low, high = contents(volume) if table.range is None else table.range
     return preset(low, high, sigma_t=AUTOMATIC_DEPTH / float(volume.radius) if table.sigma_t is None else table.sigma_t)
-
-
-def _toml(array: np.ndarray) -> str:
-    if array.ndim == 1:
-        return f"[{', '.join(_digits(x) for x in array)}]"
-    return "[\n" + "".join(f"  {_toml(row)},\n" for row in array) + "]"
-
-
-def _digits(x: Any) -> str:
-    """The shortest digits that give exactly this number again when read as float64 and converted."""
-    text = str(x)
-    return text if type(x)(float(text)) == x else repr(float(x))
 
 
 def _sampled(table: SampledTable) -> LutTransfer:

@@ -50,7 +50,8 @@ def read_npy(path: Path, given: Given) -> Stored:
     start = first_bytes(path)
     if not start.startswith(b"\x93NUMPY"):
         raise mislabelled(path, start, "a NumPy array file (.npy)")
-    shape, dtype = _npy_header(path)
+    with path.open("rb") as file:
+        shape, dtype = npy_header(file, path)
     if dtype.kind not in "biufc":
         problem = "Python objects, which are never unpickled" if dtype.hasobject else f"{dtype}, which is no type of real numbers"
         raise VolumeError(path, f"the array holds {problem}; save it as float32, for example")
@@ -65,12 +66,12 @@ def read_npy(path: Path, given: Given) -> Stored:
     return Stored(chosen(path, shape, axes_of(path, shape, given), given).of(values))
 
 
-def _npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype]:
+def npy_header(file: Any, path: Path) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type of a NumPy array file that is open for reading, or of one in an archive at `path`."""
     try:
-        with path.open("rb") as file:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(file)
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
     # NumPy parses the header as Python: a damaged one also raises errors of its tokenizer.
     except Exception as error:
         raise VolumeError(path, f"its header is damaged: {one_line(error)}; save it again") from None
