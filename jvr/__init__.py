@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from jvr.fitting.transforms import Ordered as Ordered
     from jvr.fitting.transforms import Sigmoid as Sigmoid
     from jvr.fitting.transforms import Softplus as Softplus
+    from jvr.io.exported import use_export as use_export
     from jvr.io.images import read_image as read_image
     from jvr.io.precompute import precompute as precompute
     from jvr.io.volumes import read_volume as read_volume
@@ -151,6 +152,7 @@ _NAMES = {
     "jvr.fitting.minimisers": ("LBFGSB",),
     "jvr.fitting.residuals": ("residuals",),
     "jvr.fitting.transforms": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
+    "jvr.io.exported": ("use_export",),
     "jvr.io.images": ("read_image",),
     "jvr.io.precompute": ("precompute",),
     "jvr.io.volumes": ("read_volume",),
