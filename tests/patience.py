@@ -17,7 +17,8 @@ mesh = jax.make_mesh((2,), ("rays",), axis_types=(jax.sharding.AxisType.Auto,))
 
 
 def together(count):
-    work = lambda count: jax.lax.fori_loop(0, count, lambda _, x: jnp.sin(x), jnp.float32(1))
+    thousand = lambda _, x: jax.lax.fori_loop(0, 1000, lambda _, x: jnp.sin(x), x)
+    work = lambda count: jax.lax.fori_loop(0, count, thousand, jnp.float32(1))
     own = lambda count: jax.lax.psum(work(jnp.where(jax.lax.axis_index("rays") == 0, count, 1)), "rays")
     everywhere = jax.sharding.PartitionSpec()
     return jax.shard_map(own, mesh=mesh, in_specs=everywhere, out_specs=everywhere, check_vma=False)(count)
@@ -31,7 +32,7 @@ def seconds(count):
 
 run = jax.jit(together)
 seconds(1)
-count = 1_000_000
+count = 1000
 while (took := seconds(count)) < 0.2:
     count *= 2
 print(seconds(int(count * longer / took)))

@@ -172,18 +172,19 @@ def test_two_processes_make_what_one_does(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("patience", "seconds"), [(2, 10), (86_400, 60)])
+@pytest.mark.parametrize(("patience", "seconds"), [(2, 30), (86_400, 90)])
 def test_a_device_waits_for_another_one(patience, seconds):
-    """The compiler's own choice ends the process after 40 seconds. That what is set from Python counts is seen where it is set to less."""
+    """The compiler's own choice ends the process 40 seconds after a warning, here the first second. That what is set from Python counts is
+    seen where it is set to less. (Seconds are estimated, and may be fewer where other processes come to rest.)"""
     command = [sys.executable, Path(__file__).with_name("patience.py"), str(patience), str(seconds)]
-    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    environment = os.environ | {"XLA_FLAGS": "--xla_cpu_collective_call_warn_stuck_timeout_seconds=1"}
     ran = subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)
     if patience < seconds:
         assert ran.returncode < 0, ran.stdout
         assert "rendezvous" in ran.stderr.lower()
     else:
         assert ran.returncode == 0, ran.stderr[-2000:]
-        assert float(ran.stdout) > 45
+        assert float(ran.stdout) > 45, "no longer than the compiler's own choice"
 
 
 def test_functions_of_scenes_are_exported_to_another_process(tmp_path):
