@@ -19,6 +19,7 @@ import numpy as np
 import jvr
 from benchmarks import scenes, yardsticks
 from benchmarks.light import light
+from benchmarks.preparation import preparation
 from benchmarks.timing import median, ratio, seconds
 from jvr.march.march import MarchOptions, march
 from jvr.rendering.medium import medium
@@ -153,6 +154,26 @@ def memory() -> dict[str, Any]:
     return result
 
 
+def resident() -> dict[str, Any]:
+    """Largest resident memory of a process that draws a 256^3 float32 volume, or takes the gradient in its voxels, on one device and on
+    two, less that of the same with 16^3 voxels (the interpreter and the compiler), in copies of the voxels."""
+    found = {}
+    for what in ("picture", "gradient"):
+        for count in (1, 2):
+            small, large = (_peak(what, count, n) for n in (16, 256))
+            found[f"{what}_on_{count}_bytes"] = large
+            found[f"{what}_on_{count}_in_volumes"] = (large - small) / (4 * 256**3)
+        found[f"{what}_two_over_one"] = found[f"{what}_on_2_bytes"] / found[f"{what}_on_1_bytes"]
+    return found
+
+
+def _peak(what: str, count: int, n: int) -> int:
+    """Bytes that a process holds at most."""
+    program = "from benchmarks.resident import peak; import sys; print(peak(sys.argv[1], int(sys.argv[2]), int(sys.argv[3])))"
+    command = [sys.executable, "-c", program, what, str(count), str(n)]
+    return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
 def fitting() -> dict[str, Any]:
     """The CT head protocol (docs/fitting.md): time to 60 dB in evaluations of a plain forward march over the same kept samples."""
     from experiments.protocols import ct_head
@@ -224,6 +245,8 @@ CASES = {
     "skipping": skipping,
     "devices": devices,
     "memory": memory,
+    "resident": resident,
+    "preparation": preparation,
     "light": light,
     "fitting": fitting,
     "startup": startup,

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from jvr.fitting.losses import SquaredError as SquaredError
     from jvr.fitting.minimisers import LBFGSB as LBFGSB
     from jvr.fitting.residuals import residuals as residuals
+    from jvr.io.exported import use_export as use_export
     from jvr.io.images import read_image as read_image
     from jvr.io.precompute import precompute as precompute
     from jvr.io.scenes import load_scene as load_scene

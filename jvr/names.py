@@ -24,6 +24,7 @@ NAMES = {
     "jvr.fitting.minimisers": ("LBFGSB",),
     "jvr.fitting.residuals": ("residuals",),
     "jvr.fitting.bijectors": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
+    "jvr.io.exported": ("use_export",),
     "jvr.io.images": ("read_image",),
     "jvr.io.precompute": ("precompute",),
     "jvr.io.scenes": ("load_scene", "save_scene"),

@@ -2,13 +2,14 @@
 
 import functools
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import lut_transfer, perspective
+from scenes import perspective, small
 
 import jvr
 from jvr.execution import devices
@@ -16,10 +17,7 @@ from jvr.execution import devices
 slow = pytest.mark.slow
 
 
-@functools.cache
-def plain():
-    values = np.random.default_rng(0).random((9, 7, 8)).astype(np.float32)
-    return jvr.Scene(jvr.Volume(values), lut_transfer(), background=(0.2, 0.1, 0.3))
+plain = functools.cache(small)
 
 
 def lit(shadows):
@@ -153,6 +151,35 @@ def test_a_volume_keeps_its_voxels_when_their_array_changes():
     volume = jvr.Volume(values)
     values[:] = 7
     np.testing.assert_array_equal(volume.values, 0.5)
+
+
+def test_arrays_that_take_the_place_of_voxels_are_shared():
+    """Also what is made of them, once: one copy of each."""
+    volume = jvr.Volume(np.random.default_rng(0).random((9, 7, 8)).astype(np.float32))
+    other = eqx.tree_at(lambda v: v.values, volume, 0.5 * volume.values.addressable_data(0))
+    for made in (other.current(), other.bricked(), other.graded(), other.packed()):
+        for array in jax.tree.leaves((made.values, made.bricks, made.gradients, made.squares)):
+            assert len(array.sharding.device_set) == 3
+            assert len({shard.data.unsafe_buffer_pointer() for shard in array.addressable_shards}) == 1
+    kinds = [lambda v: v.bricked(), lambda v: v.graded(), lambda v: v.packed()]
+    for kind in kinds:
+        ours, alone = jax.tree.leaves(kind(other)), jax.tree.leaves(on_one_device(kind, other))
+        close(ours, alone, 0)
+
+
+def test_threads_that_render_at_once():
+    """Four threads, pictures and gradients of scenes of their own, eagerly and within a `jit` of theirs."""
+    scene, camera = plain(), perspective(plain().volume, 9, 5)
+    with_colours = lambda rgb: eqx.tree_at(lambda s: s.transfer.rgb, scene, rgb)
+    draw = lambda rgb: jvr.render(with_colours(rgb), camera).rgb
+    slope = jax.grad(lambda rgb: jnp.mean(jnp.sin(draw(rgb))))
+    functions = [draw, jax.jit(draw), slope, jax.jit(slope)]
+    tables = [scene.transfer.rgb * k for k in np.linspace(0.1, 1.0, 10)]
+    expected = [[np.asarray(function(rgb)) for rgb in tables] for function in functions]
+    with ThreadPoolExecutor(4) as pool:
+        found = [pool.submit(lambda f: [np.asarray(f(rgb)) for rgb in tables], function) for function in functions]
+        for pictures, of in zip(found, expected, strict=True):
+            close(pictures.result(timeout=120), of)
 
 
 @slow

@@ -78,3 +78,9 @@ def orthographic(volume: jvr.Volume, width=6, height=5, direction=(1.0, -0.6, 0.
     center, radius = np.asarray(volume.center), float(volume.radius)
     eye = center + 3 * radius * np.asarray(direction) / np.linalg.norm(direction)
     return jvr.OrthographicCamera.look_at(eye, center, [0.1, 0.2, 1.0], 2 * radius, width, height)
+
+
+def small() -> jvr.Scene:
+    """A volume of floating point through a table, on a coloured background."""
+    values = np.random.default_rng(0).random((9, 7, 8)).astype(np.float32)
+    return jvr.Scene(jvr.Volume(values), lut_transfer(), background=(0.2, 0.1, 0.3))

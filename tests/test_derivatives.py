@@ -213,7 +213,7 @@ def test_modes_that_a_way_does_not_have_are_refused(x64):
     moving = {"background": p["background"], "transfer": p["transfer"]}
     with pytest.raises(TypeError, match="forward-mode"):
         jax.eval_shape(jax.jacfwd(make_loss(p, jvr.Replay())), moving)
-    with pytest.raises(ValueError, match=r"[Rr]everse-mode"):
+    with pytest.raises(ValueError, match=r"jvr.Forward\(\) has no reverse mode"):
         jax.eval_shape(jax.grad(make_loss(p, jvr.Forward())), moving)
 
 

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from jvr.effects.projected_transfer import ProjectedTransfer
 from scenes import OBLIQUE, affine, gaussian_transfer, linear_transfer, lut_transfer, perspective, render_quickly, voxels
 
 import jvr
 from jvr.atomic import replacing_together
-from jvr.effects.projected_transfer import ProjectedTransfer
 from jvr.io.config import ConfigError, read_config
 from jvr.io.scenes.kinds import PARTS, classes_of, fits
 from jvr.names import NAMES

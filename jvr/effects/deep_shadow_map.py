@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jvr.effects.light_space import AbstractLightSpace, bilinear, depth_nodes, light_space
+from jvr.effects.light_space import AbstractLightSpace, bilinear, light_space, of_swept
 from jvr.effects.shadow_volume import check_size
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
@@ -52,8 +52,10 @@ class DeepShadowMap(AbstractShadows):
             if space is None:
                 maps.append(None)
                 continue
-            clear = jnp.exp(-jnp.moveaxis(depth_nodes(space, scene, medium, self.texels, steps, 1), 0, 2))
-            maps.append(_deep_map(space, clear, self.layers, self.error))
+            pieces = lambda depths: _pieces_of(jnp.exp(-depths), self.layers, self.error)
+            z, clear, worst = of_swept(pieces, space, scene, medium, self.texels, steps, 1)
+            stats = ShadowStats(jnp.mean(worst > self.error * (1 + 1e-3)), jnp.max(worst))
+            maps.append(DeepMap(space, z, clear, stats))
         return DeepVisibility(scene.volume.world_from_grid, tuple(maps))
 
     def coarser(self) -> tuple[AbstractShadows, ...]:
@@ -116,18 +118,20 @@ def _along(z: Float[Array, "nodes"], T: Float[Array, "nodes"], w: Scalar) -> Sca
     return value
 
 
-def _deep_map(space: AbstractLightSpace, clear: Float[Array, "u v steps channels"], layers: int, error: float) -> DeepMap:
-    u, v, n, channels = clear.shape
-    rays = jnp.moveaxis(clear, -1, 2).reshape(-1, n)
+def _pieces_of(
+    clear: Float[Array, "rays steps channels"], layers: int, error: float
+) -> tuple[Float[Array, "rays nodes channels"], Float[Array, "rays nodes channels"], Float[Array, "rays channels"]]:
+    """The depths where pieces of each ray meet, the transmittances there, and the largest error anywhere along it."""
+    _, n, channels = clear.shape
+    rays = jnp.moveaxis(clear, -1, 1).reshape(-1, n)
     nodes = jax.vmap(lambda T: _pieces(T, layers, error))(jax.lax.stop_gradient(rays))
     z = nodes / (n - 1)
     T = jnp.take_along_axis(rays, nodes, axis=1)
     there = jnp.arange(n, dtype=z.dtype) / (n - 1)
     found = jax.vmap(lambda z, T: jax.vmap(lambda w: _along(z, T, w))(there))(z, jax.lax.stop_gradient(T))
     worst = jnp.max(jnp.abs(found - jax.lax.stop_gradient(rays)), axis=1)
-    stats = ShadowStats(jnp.mean(worst > error * (1 + 1e-3)), jnp.max(worst))
-    place = lambda a: jnp.moveaxis(a.reshape(u, v, channels, layers + 1), 2, -1)
-    return DeepMap(space, place(z.astype(clear.dtype)), place(T), stats)
+    place = lambda a: jnp.moveaxis(a.reshape(-1, channels, layers + 1), 1, -1)
+    return place(z.astype(clear.dtype)), place(T), worst.reshape(-1, channels)
 
 
 def _pieces(T: Float[Array, "steps"], layers: int, error: float) -> Int[Array, "nodes"]:

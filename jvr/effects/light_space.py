@@ -7,7 +7,8 @@ where the light is inside of it, by Lambert's azimuthal equal-area projection ab
 
 import abc
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -23,6 +24,8 @@ from jvr.model.scene import Scene
 from jvr.model.volume import Volume
 from jvr.numerics import clamp, direction_and_length, dot, larger, ray_box, rounded_into, smaller
 from jvr.types import Channels, Scalar, Triple, Vector
+
+Result = TypeVar("Result")
 
 # A light nearer to the bounding sphere of the volume than this fraction of its radius shines in all directions.
 NEAR = 1.01
@@ -165,15 +168,30 @@ def depth_nodes(
 ) -> Float[Array, "nodes u v channels"]:
     """Optical depth from the light to `layers + 1` equally distant depths of `texels^2` rays, by the midpoint rule with `samples` samples a
     layer, swept away from the light."""
+    nodes = of_swept(lambda depths: depths, space, scene, medium, texels, layers, samples)
+    return jnp.moveaxis(nodes, 2, 0)
+
+
+def of_swept(
+    function: Callable[[Float[Array, "rays nodes channels"]], Result],
+    space: AbstractLightSpace,
+    scene: Scene,
+    medium: Medium,
+    texels: int,
+    layers: int,
+    samples: int,
+) -> Result:
+    """What a function makes of the depths along each ray that `depth_nodes` has, for each device of its own rays: arrays
+    `(texels, texels, ...)`."""
     axis = jnp.linspace(-1.0, 1.0, texels)
     coordinates = jnp.stack([c.ravel() for c in jnp.meshgrid(axis, axis, indexing="ij")], axis=1)
     coordinates = jnp.pad(coordinates, ((0, -(texels**2) % shares()), (0, 0)), mode="edge")
 
-    def share(shared: tuple[AbstractLightSpace, Scene, Medium], coordinates: Float[Array, "rays 2"]) -> Array:
-        return _swept(*shared, coordinates, layers, samples)
+    def share(shared: tuple[AbstractLightSpace, Scene, Medium], coordinates: Float[Array, "rays 2"]) -> Result:
+        return function(_swept(*shared, coordinates, layers, samples))
 
-    swept = over_rays(share, (space, scene, medium), coordinates)
-    return jnp.moveaxis(swept[: texels**2], 1, 0).reshape(layers + 1, texels, texels, -1)
+    found = over_rays(share, (space, scene, medium), coordinates)
+    return jax.tree.map(lambda x: x[: texels**2].reshape(texels, texels, *x.shape[1:]), found)
 
 
 def _swept(

@@ -24,8 +24,8 @@ Result = TypeVar("Result")
 
 # The axis of the mesh.
 AXIS = "rays"
-# Seconds that devices of a processor wait for the last one at the end of a program. The compiler's own choice, 40, ends the process
-# where one of two cores is busy with something else for so long.
+# Seconds that devices of a processor wait for the last one at the end of a program, after a warning. The compiler's own choice, 40, ends the
+# process where one of two cores is busy with something else for so long.
 PATIENCE = 86_400
 # What becomes of an operation on it tells whether operations are traced now.
 _ZERO = np.float32(0)
@@ -107,18 +107,41 @@ def spread(array: Array) -> Array:
     """An array at hand on every device that rays are spread over: cores of a processor share one copy of it, where a program that is
     given an array of one device makes one for each core in each call."""
     among = mesh()
-    if among is None or isinstance(array, Tracer) or len(array.sharding.device_set) > 1:
+    if among is None or isinstance(array, Tracer) or not isinstance(array, jax.Array) or len(array.sharding.device_set) > 1:
         return array
     local = [device for device in among.devices.flat if device.process_index == jax.process_index()]
-    held = np.asarray(array)
-    copies = [jax.device_put(held, device, may_alias=True) for device in local]
+    held = np.asarray(array) if local[0].platform == "cpu" else array
+    # Within somebody's trace a copy would be a part of it.
+    with jax.ensure_compile_time_eval():
+        copies = [jax.device_put(held, device, may_alias=True) for device in local]
     return jax.make_array_from_single_device_arrays(array.shape, NamedSharding(among, PartitionSpec()), copies)
+
+
+def once(function: Callable[..., Result], *arguments: Any) -> Result:
+    """What a function makes of arrays at hand, by one device and then `spread`: where all of them compute the same, each has a copy. Of
+    traced arrays it is a part of their program."""
+    if mesh() is None or is_traced(arguments):
+        return function(*arguments)
+    return jax.tree.map(spread, function(*jax.tree.map(_of_one_device, arguments)))
+
+
+def _of_one_device(array: Any) -> Any:
+    """The copy of an array that the first device has, where all have one."""
+    has_all = isinstance(array, jax.Array) and array.sharding.is_fully_replicated
+    return array.addressable_data(0) if has_all else array
 
 
 def on_devices(rays: Array | np.ndarray) -> Array:
     """An array at hand with a leading axis of rays, each device with the share that `over_rays` gives it."""
     among = mesh()
-    return jnp.asarray(rays) if among is None else jax.device_put(rays, NamedSharding(among, PartitionSpec(AXIS)))
+    if among is None:
+        return jnp.asarray(rays)
+    shared = NamedSharding(among, PartitionSpec(AXIS))
+    if not among.is_multi_process:
+        return jax.device_put(rays, shared)
+    # All processes have the same rays at hand; JAX would send them around to see whether that is so.
+    held = np.asarray(rays)
+    return jax.make_array_from_callback(held.shape, shared, lambda place: held[place])
 
 
 def is_traced(tree: Any = ()) -> bool:

@@ -87,13 +87,14 @@ def in_tiles(function: Callable[[Int[Array, "blocks"]], Result], blocks: Int[Arr
 
 
 def within_memory(function: Callable[[int], Result], tile: int) -> Result:
-    """`function(tile)` of arrays at hand; where that does not fit into memory, with half the tile, with one warning."""
+    """`function(tile)` of arrays at hand; where that does not fit into memory, with half the tile, with one warning. Of several processes
+    none can go on alone with another program than the others: there what does not fit is an error."""
     warned = False
     while True:
         try:
             return jax.block_until_ready(function(tile))
         except jax.errors.JaxRuntimeError as error:
-            if "RESOURCE_EXHAUSTED" not in str(error) or tile == 1:
+            if "RESOURCE_EXHAUSTED" not in str(error) or tile == 1 or jax.process_count() > 1:
                 raise
             if not warned:
                 advice = "going on with half as many; Settings(tile=...) starts with fewer"

@@ -274,7 +274,7 @@ def _sums(channels: list[_Channel], n: int) -> Normal:
             total.matrix.at[columns[:, None], columns].add(weighted.T @ rows),
             total.vector.at[columns].add(weighted.T @ r),
         )
-    return total
+    return everywhere(total)
 
 
 def _jacobian(

@@ -250,7 +250,7 @@ def observed_medium(
 @eqx.filter_jit
 def _longest(scene: Scene, tile: Observations, settings: Settings) -> Int[Array, ""]:
     rays = _inside(scene, tile)
-    return jnp.max(segment_count(rays.length, step_length(scene, settings)))
+    return everywhere(jnp.max(segment_count(rays.length, step_length(scene, settings))))
 
 
 @eqx.filter_jit

@@ -12,6 +12,8 @@ front of the next one less its own. A segment may be arbitrarily opaque, which w
 march records, for each channel, the depth in front of the last segment that can be seen through, and differences start there.
 
 What a segment's `e` and `dtau` depend on is left to automatic differentiation of that one segment.
+
+Second derivatives are those of both walks in forward mode (`jax.jvp` of `jax.grad`), in which nothing is stored either.
 """
 
 import functools
@@ -24,13 +26,18 @@ from jaxtyping import Array, Float, Int
 
 from jvr.march.march import Marched, MarchOptions, ReplayRecord, integrate, march
 from jvr.march.medium import Medium, for_derivatives
-from jvr.march.rules import is_zero, wanted_and_fixed, with_zeros
+from jvr.march.rules import is_zero, leaping, wanted_and_fixed, with_zeros
 from jvr.march.segments import ActiveRays, SegmentBatch, active_rays, node_points, occupied_count, resample, with_lighting
 from jvr.march.steps import Rays, Sample, points_at, segment_span
 from jvr.march.sums import opacity, through, transmittance
 from jvr.march.wavefront import wavefront_while
 from jvr.numerics import materialise, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
+
+# What a derivative of a gradient is taken by.
+FORWARDS = (
+    "second derivatives are taken forwards: use jax.jvp(jax.grad(loss), (x,), (v,)) in place of a gradient of jax.grad(loss)"
+)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -40,7 +47,7 @@ def replay_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) 
 
 def _replay_forward(options: MarchOptions, *arguments: Any):
     wanted, fixed = wanted_and_fixed(arguments)
-    gathered, record = integrate(options, *eqx.combine(wanted, fixed), for_replay=True)
+    gathered, record = _integrate(options, *eqx.combine(wanted, fixed))
     return gathered, (wanted, fixed, record)
 
 
@@ -49,9 +56,11 @@ def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
         # Nobody asks for the derivative of the distance: it is then not replayed either.
         cotangent = cotangent._replace(distance=())
     wanted, fixed, record = residuals
-    return replay(wanted, fixed, record, with_zeros(cotangent)._replace(steps=None))
+    return _replay(None, wanted, fixed, record, with_zeros(cotangent)._replace(steps=None))
 
 
+_integrate = leaping(functools.partial(integrate, for_replay=True), FORWARDS)
+_replay = leaping(lambda _, *arguments: replay(*arguments), FORWARDS)
 replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
 
 

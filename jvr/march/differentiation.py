@@ -8,11 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jvr.march.adjoint import Inputs, is_there, replay_march
+from jvr.march.adjoint import FORWARDS, Inputs, is_there, replay_march
 from jvr.march.jacobian import TableJacobian, table_jacobian
 from jvr.march.march import Marched, MarchOptions, march
 from jvr.march.medium import Medium, taking_all
-from jvr.march.rules import is_zero
+from jvr.march.rules import forwards_only, is_zero, leaping
 from jvr.march.steps import Rays
 from jvr.model.transfer import AbstractTable, AbstractTransfer
 from jvr.types import Scalar
@@ -29,7 +29,8 @@ class AbstractAdjoint(eqx.Module):
 class Replay(AbstractAdjoint):
     """Reverse mode by replay, for any number of unknowns: memory does not grow with the number of steps. The default.
 
-    JAX refuses forward mode (`jvp`, `jacfwd`) through it: use `Forward()`, or `Rows()` for few unknowns.
+    JAX refuses forward mode (`jvp`, `jacfwd`) through it: use `Forward()`, or `Rows()` for few unknowns. Second derivatives are taken
+    forwards, `jax.jvp(jax.grad(loss), (x,), (v,))`; a gradient of `jax.grad(loss)` raises `ValueError`.
     """
 
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
@@ -37,11 +38,12 @@ class Replay(AbstractAdjoint):
 
 
 class Forward(AbstractAdjoint):
-    """Forward mode (`jvp`, `jacfwd`), for one or few directions; takes every sample that is not negligible. JAX refuses reverse mode
-    through it: use `Replay()`."""
+    """Forward mode (`jvp`, `jacfwd`, any number of times), for one or few directions; takes every sample that is not negligible. Reverse
+    mode through it raises `ValueError`: use `Replay()`."""
 
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
-        return march(options, taking_all(medium), rays, dt)
+        remedy = "jvr.Forward() has no reverse mode: use Settings(adjoint=jvr.Replay()), or jvr.Rows() for few unknowns"
+        return forwards_only(march(options, taking_all(medium), rays, dt), remedy)
 
 
 class Rows(AbstractAdjoint):
@@ -49,7 +51,7 @@ class Rows(AbstractAdjoint):
 
     The derivative of each ray with respect to every perturbed array is computed once and held, `rays x unknowns` numbers; a
     tangent is that matrix times a direction. Entries of a table come out of one replay, with hat functions, at about the cost of a
-    gradient; other arrays by one reverse pass for each ray and output.
+    gradient; other arrays by one reverse pass for each ray and output. Second derivatives as of `Replay()`.
     """
 
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
@@ -73,9 +75,9 @@ def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tup
         )
     rest_of_transfer, entries = _split_entries(tangents[0].transfer)
     if options.distance or not jax.tree.leaves(entries):
-        primal, tangent = march(options, *primals), None
+        primal, tangent = _march(options, *primals), None
     else:
-        primal, rows = table_jacobian(options, medium, rays, dt, of_extinctions=entries.sigma_t is not None)
+        primal, rows = _table_jacobian((options, entries.sigma_t is not None), medium, rays, dt)
         tangents = (tangents[0]._replace(transfer=rest_of_transfer), *tangents[1:])
         tangent = _times_entries(rows, entries)
     if jax.tree.leaves(tangents):
@@ -88,6 +90,8 @@ def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tup
 
 
 _jacobian_march.defjvp(_jacobian_rule, symbolic_zeros=True)
+_march = leaping(march, FORWARDS)
+_table_jacobian = leaping(lambda options, *inputs: table_jacobian(options[0], *inputs, of_extinctions=options[1]), FORWARDS)
 
 
 def _split_entries(tree: AbstractTransfer) -> tuple[Any, Any]:

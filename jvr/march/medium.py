@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jvr.march.occupancy import Occupancy
@@ -110,3 +111,10 @@ def taking_all(medium: Medium) -> Medium:
     is_occupancy = lambda x: isinstance(x, Occupancy)
     dropped = lambda x: None if is_occupancy(x) and not x.is_bounded else x
     return jax.tree.map(dropped, medium, is_leaf=is_occupancy)
+
+
+def showing_all(media: Any) -> Any:
+    """Media, whole or in parts, in which nothing that may have a derivative is leapt over: as `taking_all`, in the same structure."""
+    is_occupancy = lambda x: isinstance(x, Occupancy)
+    shown = lambda x: jax.tree.map(jnp.zeros_like, x) if is_occupancy(x) and not x.is_bounded else x
+    return jax.tree.map(shown, media, is_leaf=is_occupancy)

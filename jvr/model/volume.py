@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from jvr.execution.devices import spread
+from jvr.execution.devices import once, spread
 from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder
@@ -177,9 +177,10 @@ class Volume(eqx.Module):
         """
         if isinstance(size, bool) or not isinstance(size, int) or size < 1:
             raise ValueError(f"the size of a brick must be a positive whole number of voxels, not {size!r}; 4 is a good start")
-        bricks = _bricks(jax.lax.stop_gradient(self.values), size)
-        note_sources(bricks.lower, self.values)
-        return eqx.tree_at(lambda v: v.bricks, self, bricks, is_leaf=lambda x: x is None)
+        volume = self._spread()
+        bricks = once(lambda values: _bricks(values, size), jax.lax.stop_gradient(volume.values))
+        note_sources(bricks.lower, volume.values)
+        return eqx.tree_at(lambda v: v.bricks, volume, bricks, is_leaf=lambda x: x is None)
 
     def packed(self) -> "Volume":
         """The same volume with its voxels packed for interpolation as well: faster pictures and fits, for 4 more bytes a voxel.
@@ -191,8 +192,8 @@ class Volume(eqx.Module):
         """
         if not isinstance(self.interpolation, Trilinear):
             raise ValueError("only trilinear interpolation reads packed voxels: set Volume(interpolation=jvr.Trilinear())")
-        volume = self if self.values.dtype == jnp.uint8 else _quantised(self)
-        squares = _squares(volume.values)
+        volume = self._spread() if self.values.dtype == jnp.uint8 else _quantised(self)
+        squares = once(_squares, volume.values)
         note_sources(squares.entries, volume.values)
         return eqx.tree_at(lambda v: v.squares, volume, squares, is_leaf=lambda x: x is None).current()
 
@@ -200,9 +201,16 @@ class Volume(eqx.Module):
         """The same volume with the gradients at its voxels, which `jvr.PrecomputedGradient()` interpolates; without them each picture
         computes them anew, as it does where voxels, slope or intercept are differentiated or arguments of `jit` (`current`). They take
         12 bytes a voxel."""
-        gradients = _gradients(self.values, self.slope, self.intercept)
-        note_sources(gradients, self.values, self.slope, self.intercept)
-        return eqx.tree_at(lambda v: v.gradients, self, gradients, is_leaf=lambda x: x is None)
+        volume = self._spread()
+        arrays = volume.values, volume.slope, volume.intercept
+        gradients = once(_gradients, *arrays)
+        note_sources(gradients, *arrays)
+        return eqx.tree_at(lambda v: v.gradients, volume, gradients, is_leaf=lambda x: x is None)
+
+    def _spread(self) -> "Volume":
+        """The same volume with its voxels on all devices, also those that took the place of others (`equinox.tree_at`)."""
+        values = spread(self.values)
+        return self if values is self.values else eqx.tree_at(lambda v: v.values, self, values)
 
     def current(self) -> "Volume":
         """The same volume with what it keeps made anew where voxels, slope or intercept are not the very arrays that it was made of.
@@ -211,11 +219,12 @@ class Volume(eqx.Module):
         cost. Traced ones are not: there bricks and gradients are made for each picture, the latter with their derivative, and squares
         where they do not hold the voxels.
         """
+        volume = self._spread()
         if any(isinstance(x, Tracer) for x in (self.values, self.slope, self.intercept)):
-            return self._current()
+            return volume._current()
         # Within a traced function that closes over them they are constants, and the compiler would take seconds to fold all of this.
         with jax.ensure_compile_time_eval():
-            return self._current()
+            return volume._current()
 
     def _current(self) -> "Volume":
         volume = self
@@ -226,7 +235,7 @@ class Volume(eqx.Module):
         if self.squares is None or is_made_of(self.squares.entries, self.values):
             return volume
         fits = self.values.dtype == jnp.uint8 and self.values.shape == self.squares.entries.shape
-        squares = _squares_if_other(self.values, self.squares) if fits else None
+        squares = once(_squares_if_other, self.values, self.squares) if fits else None
         if squares is not None:
             note_sources(squares.entries, self.values)
         return eqx.tree_at(lambda v: v.squares, volume, squares)
@@ -380,11 +389,13 @@ def _squares_if_other(values: Voxels, squares: Squares) -> Squares:
 
 def _quantised(volume: Volume) -> Volume:
     """The volume with `uint8` voxels."""
-    values = jax.lax.stop_gradient(volume.values).astype(volume.slope.dtype)
+    values, kind = jax.lax.stop_gradient(volume.values), volume.slope.dtype
     traced = isinstance(values, Tracer)
-    low, high = (jnp.min(values), jnp.max(values)) if traced else map(jnp.asarray, typical_range(volume.data()))
+    ends = (jnp.min(values).astype(kind), jnp.max(values).astype(kind)) if traced else typical_range(volume.data())
+    low, high = map(jnp.asarray, ends)
     scale = jnp.where(high > low, (high - low) / 255, 1.0)
-    levels = jnp.clip(jnp.round((values - low) / scale), 0, 255).astype(jnp.uint8)
+    level = lambda values: jnp.clip(jnp.round((values.astype(kind) - low) / scale), 0, 255).astype(jnp.uint8)
+    levels = once(level, values)
     slope, intercept = volume.slope * scale, volume.slope * low + volume.intercept
     # A level that happens to be the number of missing voxels is none of them.
     quantised = dataclasses.replace(volume, values=levels, slope=slope, intercept=intercept, missing=None)

@@ -101,7 +101,7 @@ def _render(scene: Scene, camera: AbstractCamera, settings: Settings) -> Renderi
     prepared, dealt = prepare(scene, settings), dealt_blocks(height, width, shares())
     rays = everywhere(over_rays(share, (scene, camera, prepared), dealt))
     (rgb, alpha, depth), steps = picture_of(rays, height, width, shares())
-    return Rendering(rgb, alpha, depth, RenderStats(steps, shadows=prepared.shadow_stats))
+    return Rendering(rgb, alpha, depth, RenderStats(steps, shadows=everywhere(prepared.shadow_stats)))
 
 
 def _render_blocks(
