@@ -24,8 +24,8 @@ Result = TypeVar("Result")
 
 # The axis of the mesh.
 AXIS = "rays"
-# Seconds that devices of a processor wait for the last one at the end of a program, after a warning. The compiler's own choice, 40, ends the
-# process where one of two cores is busy with something else for so long.
+# Seconds that devices of a processor wait for the last one at the end of a program, after a warning. The compiler's own choice, 40,
+# ends the process where one of two cores is busy with something else for so long.
 PATIENCE = 86_400
 # What becomes of an operation on it tells whether operations are traced now.
 _ZERO = np.float32(0)

@@ -35,9 +35,9 @@ def use_export() -> None:
         jvr.use_export()
         picture = jax.export.deserialize(bytearray(Path("picture.bin").read_bytes())).call(scene)
 
-    JAX writes it by the package `flatbuffers` (`pip install "jvr[export]"`). To be called in both, after the classes of one's own that derive from jvr's; any number of times. What is written is the structure of
-    arguments and results, as JSON, nothing that is executed when it is read. **Raises** `TypeError`, while that is written, for static
-    fields other than numbers, strings and tuples of them.
+    JAX writes it by the package `flatbuffers` (`pip install "jvr[export]"`). To be called in both, after the classes of one's own that
+    derive from jvr's; any number of times. What is written is the structure of arguments and results, as JSON, nothing that is executed
+    when it is read. **Raises** `TypeError`, while that is written, for static fields other than numbers, strings and tuples of them.
     """
     for package in PACKAGES:
         for found in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}."):
