@@ -72,7 +72,9 @@ def radiance_transfer_visibility(
         order = material.projected(scene.material_order).order
         incident = _over_nodes(lambda light, nodes: _products(nodes, light, order), light, coefficients)
     else:
-        incident = _over_nodes(lambda light, nodes: _fractions(nodes[0], nodes[1], light), light, (projected.facing, coefficients))
+        incident = _over_nodes(
+            lambda light, nodes: _fractions(nodes[0], nodes[1], light), light, (projected.facing, coefficients)
+        )
     if material.needs_gradient:
         incident = jnp.concatenate([incident, projected.solid[..., None]], axis=-1)
     shape = coefficients.shape[:3]
