@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
-from jvr.effects.projected_transfer import ProjectedTransfer
 from scenes import OBLIQUE, affine, gaussian_transfer, linear_transfer, lut_transfer, perspective, render_quickly, voxels
 
 import jvr
 from jvr.atomic import replacing_together
+from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
 from jvr.io.config import ConfigError, read_config
 from jvr.io.scenes.kinds import PARTS, classes_of, fits
 from jvr.names import NAMES
@@ -100,7 +100,7 @@ def frozen() -> jvr.Scene:
     luminance, chroma, solid, facing = numbers[..., None, :4], numbers[..., 4:6, None], numbers[..., 6], numbers[..., 7:]
     made_for = np.arange(12, dtype=np.uint32).reshape(6, 2)
     arrays = map(jnp.asarray, (luminance, chroma, solid, facing))
-    done = ProjectedTransfer(*arrays, lut_transfer(), jnp.asarray(made_for), scattered=True, pinned=True)
+    done = ProjectedRadianceTransfer(*arrays, lut_transfer(), jnp.asarray(made_for), scattered=True, pinned=True)
     return natural(radiance_transfer=transfer.with_projected(done))
 
 
@@ -519,8 +519,8 @@ def test_shapes_and_types_are_checked_where_no_constructor_does(tmp_path):
     path = tmp_path / "a.toml"
     jvr.save_scene(projected(), path)
     text = path.read_text()
-    path.write_text(text.replace('about = "both"', 'about = "nothing"'))
-    assert 'material.tinted.about: is the text "nothing"; it must be "normal" or "eye" or "both"' in refusal(path)
+    path.write_text(text.replace('symmetry_axis = "both"', 'symmetry_axis = "nothing"'))
+    assert 'material.tinted.symmetry_axis: is the text "nothing"; it must be "normal" or "eye" or "both"' in refusal(path)
     path.write_text(re.sub(r"(tinted\]\ncoefficients = ).*", r"\1[1, 2]", text, count=1))
     assert refusal(path).startswith("a.toml: material.tinted")
 
