@@ -231,9 +231,11 @@ def plan(
 
     bound = None if tolerance is None else as_tolerance(tolerance)
     with reading():
+        from jvr.cli.runtime import start_jax
         from jvr.io.config import build_scene, build_settings
         from jvr.rendering.plan import plan as make_plan
 
+        start_jax()
         config = load(given, sets or [])
         scene = build_scene(config)
         if scene.environment is not None:
