@@ -1,11 +1,15 @@
 """Shapes and types that the annotations of `jvr` claim are checked at run time in every test."""
 
 import os
+from importlib import metadata
 from pathlib import Path
 
 os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "false")
 # Most of the time goes into compiling programs that run for a moment: a quarter of it without what makes them fast.
-CHEAP = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+CHEAP = "--xla_backend_optimization_level=0"
+if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
+    # Later compilers do not know this flag, and a flag that is not known ends the process.
+    CHEAP += " --xla_cpu_use_fusion_emitters=false"
 os.environ["XLA_FLAGS"] = f"{CHEAP} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 from jaxtyping import install_import_hook

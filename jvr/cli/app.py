@@ -133,14 +133,8 @@ def render(
         output = Path(f"{name_of(given)}.png") if output is None else output
         check_image_output(output)
         choice = {"array": array, "series": series, "axes": axes, "channel": channel, "time": time}
-        scaled = {
-            "direction": _matrix(direction),
-            "slope": slope,
-            "intercept": intercept,
-            "missing": missing,
-            "nan_value": nan_value,
-        }
-        keywords = _given(shape, spacing, origin, dtype=dtype, **choice, **scaled)
+        scaled = {"slope": slope, "intercept": intercept, "missing": missing, "nan_value": nan_value}
+        keywords = _given(shape, spacing, origin, direction, dtype=dtype, **choice, **scaled)
         wishes = Wishes(preset, view, _triple(up, "--up", float, positive=False), background, orbit, lit)
         config, volume, notes = configured(given, sets or [], keywords, wishes)
         config = _sized(config, size)
@@ -277,14 +271,8 @@ def info(
         from jvr.io.volumes import read_volume
 
         choice = {"array": array, "series": series, "axes": axes, "channel": channel, "time": time}
-        scaled = {
-            "direction": _matrix(direction),
-            "slope": slope,
-            "intercept": intercept,
-            "missing": missing,
-            "nan_value": nan_value,
-        }
-        keywords = _given(shape, spacing, origin, dtype=dtype, **choice, **scaled)
+        scaled = {"slope": slope, "intercept": intercept, "missing": missing, "nan_value": nan_value}
+        keywords = _given(shape, spacing, origin, direction, dtype=dtype, **choice, **scaled)
         found = describe(read_volume(volume, **keywords), volume)
     _print(found, as_json, format_description(found))
 
@@ -306,10 +294,10 @@ def demo(
     _print(report, as_json, _summary(report, output))
 
 
-def _given(shape: str | None, spacing: str | None, origin: str | None, **others: Any) -> dict[str, Any]:
+def _given(shape: str | None, spacing: str | None, origin: str | None, direction: str | None, **others: Any) -> dict[str, Any]:
     """Keywords of a volume from flags."""
     triples: dict[str, Any] = {"shape": _triple(shape, "--shape", int), "spacing": _triple(spacing, "--spacing", float)}
-    triples["origin"] = _triple(origin, "--origin", float, positive=False)
+    triples |= {"origin": _triple(origin, "--origin", float, positive=False), "direction": _matrix(direction)}
     if (missing := others.pop("missing")) is not None:
         triples["missing"] = False if missing.lower() == "none" else _number(missing, "--missing")
     return {name: value for name, value in (triples | others).items() if value is not None}
