@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     from jvr.model.camera import PerspectiveCamera as PerspectiveCamera
     from jvr.model.camera import fibonacci_sphere as fibonacci_sphere
     from jvr.model.camera import orbit as orbit
+    from jvr.model.clipping import ClippingBox as ClippingBox
     from jvr.model.dipole import Dipole as Dipole
     from jvr.model.environment import EnvironmentLight as EnvironmentLight
     from jvr.model.gradient_transfer import GradientOpacity as GradientOpacity
@@ -102,7 +103,6 @@ if TYPE_CHECKING:
     from jvr.model.transfer import GaussianTransfer as GaussianTransfer
     from jvr.model.transfer import LinearTransfer as LinearTransfer
     from jvr.model.transfer import LutTransfer as LutTransfer
-    from jvr.model.volume import ClippingBox as ClippingBox
     from jvr.model.volume import Nearest as Nearest
     from jvr.model.volume import Trilinear as Trilinear
     from jvr.model.volume import Volume as Volume

@@ -9,7 +9,7 @@ is after Weiskopf, Engel and Ertl, "Interactive clipping techniques for texture-
 import equinox as eqx
 import jax.numpy as jnp
 
-from jvr.model.volume import ClippingBox
+from jvr.model.clipping import ClippingBox
 from jvr.numerics import direction_and_length
 from jvr.types import Scalar, Triple
 

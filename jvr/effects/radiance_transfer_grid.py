@@ -20,10 +20,11 @@ from jvr.execution.devices import over_rays, shares
 from jvr.execution.tiles import dealt, joined
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
+from jvr.model.clipping import ClippingBox
 from jvr.model.harmonics.algebra import product_matrix
 from jvr.model.harmonics.basis import band_of, basis
 from jvr.model.scene import Scene
-from jvr.model.volume import ClippingBox, Volume
+from jvr.model.volume import Volume
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import Channels
 

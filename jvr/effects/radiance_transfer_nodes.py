@@ -16,9 +16,10 @@ from jvr.effects.shading import surface_weight
 from jvr.march.medium import Medium
 from jvr.march.segments import classify_at
 from jvr.march.steps import Point
+from jvr.model.clipping import ClippingBox
 from jvr.model.harmonics.basis import basis
 from jvr.model.light import perpendicular
-from jvr.model.volume import ClippingBox, Volume
+from jvr.model.volume import Volume
 from jvr.numerics import direction_and_length, larger, one_minus_exp, ray_box, rounded_into, smaller
 from jvr.types import Channels, Triple
 

@@ -11,10 +11,10 @@ from jvr.march.fields import VoxelField
 from jvr.march.march import Marched, MarchOptions, march
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point, Rays
+from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
-from jvr.model.volume import ClippingBox
 from jvr.numerics import ray_box, smaller
 from jvr.types import Channels, Scalar
 

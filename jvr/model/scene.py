@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 
 from jvr.model.checks import colours
+from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer, AbstractScattering, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
 from jvr.model.light import AbstractLight, AmbientLight
@@ -12,7 +13,7 @@ from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
 from jvr.model.ranges import UNIT_INTERVAL, within
 from jvr.model.transfer import AbstractTransfer
-from jvr.model.volume import ClippingBox, Volume
+from jvr.model.volume import Volume
 from jvr.types import ArrayLike, Vector
 
 

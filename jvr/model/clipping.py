@@ -1,0 +1,35 @@
+"""The part of the world that is rendered."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from jvr.model.checks import float_array, require
+from jvr.model.exact import Exact, Remainder
+from jvr.types import ArrayLike, Vector
+
+
+class ClippingBox(eqx.Module):
+    """An axis-aligned box in world coordinates; what lies outside of it is not rendered.
+
+    **Arguments:** `lower`, `upper`: `(3,)`, differentiable (moving a face changes where rays enter and leave); `remainders`: of corners
+    that JAX holds already (see `jvr.model.exact`).
+    **Raises** `ValueError` where `lower` is not below `upper` on every axis.
+    """
+
+    lower: Vector
+    upper: Vector
+    remainders: tuple[Remainder, Remainder]
+
+    def __init__(self, lower: ArrayLike, upper: ArrayLike, *, remainders: tuple[Remainder, Remainder] | None = None):
+        self.lower = float_array(lower, "ClippingBox lower", (3,))
+        self.upper = float_array(upper, "ClippingBox upper", (3,))
+        given = remainders or (None, None)
+        self.remainders = (Remainder.left(lower, self.lower, given[0]), Remainder.left(upper, self.upper, given[1]))
+        require(self.upper - self.lower, lambda d: d > 0, "ClippingBox needs lower < upper on every axis")
+
+    def moved(self, origin: Exact) -> "ClippingBox":
+        """The same box in a world whose origin is at `origin`."""
+        corners = zip((self.lower, self.upper), self.remainders, strict=True)
+        # A face that is infinitely far away stays there.
+        lower, upper = (jnp.where(jnp.isfinite(x), Exact(x, rest.beside(x)).minus(origin).rounded(), x) for x, rest in corners)
+        return ClippingBox(lower, upper)
