@@ -20,13 +20,14 @@ import typer.main
 from pages import PAGES, ROOT
 
 import jvr
+from docs import reference
 from jvr import cli
 from jvr.cli.app import app
 from jvr.io.config import build_fit, build_scene, config_from
 from jvr.names import NAMES
 
 PUBLIC = {name for names in NAMES.values() for name in names}
-LANGUAGES = {"python", "sh", "toml", "bibtex"}
+LANGUAGES = {"python", "sh", "toml", "math", "bibtex"}
 
 
 def test_every_block_names_its_language():
@@ -141,6 +142,19 @@ def test_saved_scenes_are_valid(block, tmp_path):
     }
 
 
+# --- The reference ---------------------------------------------------------------------------------------------------
+
+
+def test_the_reference_has_every_public_name():
+    text = "\n".join(REFERENCE.values())
+    for name in PUBLIC:
+        assert re.search(rf"^:+{{py:\w+}} jvr\.{name}(?!\w)", text, re.MULTILINE), name
+        assert getattr(jvr, name).__doc__, name
+    assert "py:function} jvr.sh.project(" in text
+    assert "py:function} jvr.presets.ct()" in text
+    assert "py:classmethod} look_at(eye, target, up, fov_y, width, height)" in text
+
+
 # --- Commands: they parse, and the files and tests of this repository that they name are there -----------------------
 
 
@@ -240,7 +254,7 @@ def headings(text: str) -> set[str]:
 
 
 TEXTS = PAGES | pages.sources()
-FILE = re.compile(r"\b(?:(?:jvr|docs|configs|experiments|benchmarks)/[\w./-]*\w|tests/[\w./-]+\.py(?:::\w+)?)")
+FILE = re.compile(r"(?<![\w/])(?:(?:jvr|docs|configs|experiments|benchmarks)/[\w./-]*\w|tests/[\w./-]+\.py(?:::\w+)?)")
 
 
 @pytest.mark.parametrize("page", [page for page, text in TEXTS.items() if FILE.search(text)])
@@ -262,9 +276,9 @@ def found(node: ast.expr):
     return jvr if name == "jvr" else getattr(jvr, name) if name in PUBLIC - {"fit"} else None
 
 
-def expressions(page: str):
+def expressions(page: str, text: str):
     """Every expression within the code of sentences, with the line of its paragraph."""
-    for line, span in pages.spans(PAGES[page]):
+    for line, span in pages.spans(text):
         try:
             tree = ast.parse(span, mode="eval")
         except SyntaxError:
@@ -272,9 +286,12 @@ def expressions(page: str):
         yield from ((f"{page}:{line}: {ast.unparse(node)}", node) for node in ast.walk(tree))
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page != "CHANGELOG.md"])
+REFERENCE = reference.pages()
+
+
+@pytest.mark.parametrize("page", [*(PAGES.keys() - {"CHANGELOG.md"}), *REFERENCE])
 def test_names_and_arguments_exist(page):
-    for place, node in expressions(page):
+    for place, node in expressions(page, (PAGES | REFERENCE)[page]):
         if isinstance(node, (ast.Attribute, ast.Name)):
             try:
                 found(node)
