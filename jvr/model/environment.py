@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jvr.model import harmonics
 from jvr.model.checks import float_array, known, radiances, require
 from jvr.model.harmonics.projection import cap
-from jvr.model.ranges import NOT_NEGATIVE
+from jvr.model.ranges import ANY, NOT_NEGATIVE, within
 from jvr.numerics import normalise
 from jvr.pictures import as_radiance
 from jvr.types import ArrayLike
@@ -28,7 +28,7 @@ class EnvironmentLight(eqx.Module):
     Sums of environments are environments: `probe + EnvironmentLight.disc(...)`.
     """
 
-    coefficients: Float[Array, "bands 3"]
+    coefficients: Float[Array, "bands 3"] = eqx.field(metadata=within(ANY, by_channel=True))
     clamped: bool = eqx.field(static=True)
 
     def __init__(self, coefficients: ArrayLike, *, clamped: bool = True):

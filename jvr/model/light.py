@@ -53,7 +53,7 @@ class DirectionalLight(AbstractLight):
     """
 
     direction: Vector = eqx.field(metadata=within(UnitVector()))
-    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
 
     def __init__(self, direction: ArrayLike, irradiance: ArrayLike = 1.0):
         self.direction = _direction(direction, "DirectionalLight")
@@ -77,7 +77,7 @@ class PointLight(AbstractLight):
     """
 
     position: Vector
-    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
     radius: Scalar = eqx.field(metadata=within(POSITIVE))
     attenuation: Vector | None = eqx.field(metadata=within(ATTENUATION))
     remainder: Remainder
@@ -118,7 +118,7 @@ class SpotLight(AbstractLight):
 
     position: Vector
     direction: Vector = eqx.field(metadata=within(UnitVector()))
-    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
     inner: Scalar = eqx.field(metadata=within(DEGREES))
     outer: Scalar = eqx.field(metadata=within(DEGREES))
     radius: Scalar = eqx.field(metadata=within(POSITIVE))
@@ -166,7 +166,7 @@ class HeadLight(AbstractLight):
 
     casts_shadows: ClassVar[bool] = False
 
-    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
 
     def __init__(self, irradiance: ArrayLike = 1.0):
         self.irradiance = _colour(irradiance, "irradiance")
@@ -181,7 +181,7 @@ class HeadLight(AbstractLight):
 class AmbientLight(eqx.Module):
     """Ambient light: the same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
 
-    radiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    radiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
 
     def __init__(self, radiance: ArrayLike = 1.0):
         self.radiance = _colour(radiance, "radiance")
