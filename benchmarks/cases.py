@@ -184,10 +184,10 @@ def fitting() -> dict[str, Any]:
         return {"skipped": "needs the CT head of the public volumes: set JVR_DATA to their folder"}
     start, cameras, images, settings = protocol.start, protocol.cameras, protocol.images, protocol.settings
     chunk = sum(camera.width * camera.height for camera in cameras)
-    observations = observe(start, cameras, images, None, settings).dealt(chunk)
-    kept = keep_samples(start, observations, settings, chunk, 2**31, clamped=True)
+    observations = observe(start, cameras, images, None, settings, chunk)
+    kept = keep_samples(start, observations, settings, 2**31, clamped=True)
     assert kept is not None
-    through, rays = observed_medium(start, kept[1], kept[0], settings, prepare_in_fit(start, settings, False))
+    through, rays = observed_medium(start, kept[1].tile(0), kept[0], settings, prepare_in_fit(start, settings, False))
     plain = jax.jit(yardsticks.kept_march)
     dt = step_length(start, settings)
     jax.block_until_ready(plain(through, rays, dt))
