@@ -29,7 +29,6 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import render
 from jvr.rendering.measure import similarity
-from jvr.rendering.medium import needs_gradient
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
 
@@ -265,7 +264,7 @@ def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool |
     """Samples along the rays, where the volume and its clipping are known and memory allows."""
     moving = any(name.startswith(("scene.volume", "scene.clipping")) for name in problem.unknowns.names)
     # What is kept is the scalar alone.
-    if keep is False or moving or needs_gradient(problem.model.scene) or isinstance(problem.loss, DSSIM):
+    if keep is False or moving or problem.model.scene.needs_gradient or isinstance(problem.loss, DSSIM):
         return problem, observations
     limit = KEEP_LIMIT if keep is True else keep
     ends = ("scene.transfer.positions", "scene.transfer.domain")

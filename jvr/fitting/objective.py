@@ -25,7 +25,6 @@ from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
-from jvr.rendering.medium import needs_gradient
 from jvr.rendering.settings import Settings
 from jvr.rendering.trace import Prepared, composite, step_length, trace
 from jvr.types import Image, Scalar, Triple
@@ -385,7 +384,7 @@ class _Kinds(NamedTuple):
 
 def has_table_jacobian(scene: Scene) -> bool:
     """Whether entries of the transfer function act through what a sample is classified as, and nothing else."""
-    by_gradient = needs_gradient(scene) and scene.normals.follows_transfer(scene.volume)
+    by_gradient = scene.needs_gradient and scene.normals.follows_transfer(scene.volume)
     shade = scene.shadows is not None or (scene.radiance_transfer is not None and not scene.radiance_transfer.is_frozen)
     return isinstance(scene.transfer, AbstractTable) and not shade and not by_gradient
 
