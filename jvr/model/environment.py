@@ -14,7 +14,7 @@ from jvr.model import harmonics
 from jvr.model.checks import float_array, known, radiances, require
 from jvr.model.harmonics.projection import cap
 from jvr.model.parts import AbstractPart, PlanEntry, is_zero, spelling
-from jvr.model.ranges import NOT_NEGATIVE
+from jvr.model.ranges import ANY, NOT_NEGATIVE, within
 from jvr.numerics import normalise
 from jvr.pictures import as_radiance
 from jvr.types import ArrayLike
@@ -30,7 +30,7 @@ class EnvironmentLight(AbstractPart):
     Sums of environments are environments: `probe + EnvironmentLight.disc(...)`.
     """
 
-    coefficients: Float[Array, "bands 3"]
+    coefficients: Float[Array, "bands 3"] = eqx.field(metadata=within(ANY, by_channel=True))
     clamped: bool = eqx.field(static=True)
 
     def __init__(self, coefficients: ArrayLike, *, clamped: bool = True):

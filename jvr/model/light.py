@@ -77,7 +77,7 @@ class DirectionalLight(AbstractLight):
     """
 
     direction: Vector = eqx.field(metadata=within(UnitVector()))
-    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
 
     def __init__(self, direction: ArrayLike, irradiance: ArrayLike = 1.0):
         self.direction = _direction(direction, "DirectionalLight")
@@ -101,7 +101,7 @@ class PointLight(AbstractLight):
     """
 
     position: Vector
-    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
     radius: Scalar = eqx.field(metadata=within(POSITIVE))
     attenuation: Vector | None = eqx.field(metadata=within(ATTENUATION))
     remainder: Remainder
@@ -142,7 +142,7 @@ class SpotLight(AbstractLight):
 
     position: Vector
     direction: Vector = eqx.field(metadata=within(UnitVector()))
-    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
     inner: Scalar = eqx.field(metadata=within(DEGREES))
     outer: Scalar = eqx.field(metadata=within(DEGREES))
     radius: Scalar = eqx.field(metadata=within(POSITIVE))
@@ -190,7 +190,7 @@ class HeadLight(AbstractLight):
 
     casts_shadows: ClassVar[bool] = False
 
-    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
 
     def __init__(self, irradiance: ArrayLike = 1.0):
         self.irradiance = _colour(irradiance, "irradiance")
@@ -205,10 +205,16 @@ class HeadLight(AbstractLight):
 class AmbientLight(AbstractEmitter):
     """Ambient light: the same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
 
-    radiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE))
+    radiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
 
     def __init__(self, radiance: ArrayLike = 1.0):
         self.radiance = _colour(radiance, "radiance")
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        yield from super().remarks(name, scene, stats)
+        reflects = scene.shading is not None and not is_zero(scene.shading.ambient_reflectance())
+        if scene.shows_lights and scene.scattering is None and not reflects:
+            yield f"{self.title(name, scene)} is not seen: shading.ambient is zero"
 
     @property
     def rgb(self) -> Triple:

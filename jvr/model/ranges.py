@@ -1,4 +1,4 @@
-"""The values that a parameter may take, declared once beside its field: constructors check them and a fit keeps to them."""
+"""What a parameter may be and how it acts, declared once beside its field: constructors check its values, and a fit keeps to them."""
 
 import dataclasses
 import math
@@ -77,19 +77,33 @@ DEGREES = Interval(0.0, 180.0)
 INCREASING = Increasing()
 
 
-def within(declared: Range) -> dict[str, Range]:
-    """The metadata of a field whose array takes values in a range: `eqx.field(metadata=within(UNIT_INTERVAL))`."""
-    return {"range": declared}
+def within(declared: Range, *, by_channel: bool = False) -> dict[str, Any]:
+    """The metadata of a field whose array takes values in a range: `eqx.field(metadata=within(UNIT_INTERVAL))`.
+
+    `by_channel`: where the last axis of the array is colour, each of its channels acts on that channel of a picture alone, as those of
+    light do. A fit then takes one forward derivative for all three.
+    """
+    return {"range": declared, "by_channel": by_channel}
 
 
 def range_at(tree: Any, path: tuple[Any, ...]) -> Range:
     """The range of the leaf of `tree` at a path of `jax.tree_util`: the innermost that is declared along it, such as that of an
     asymmetry for the values of a `jvr.ByValue` in its place, and any number where none is."""
-    found: Range = ANY
+    return _declared_at(tree, path).get("range", ANY)
+
+
+def is_by_channel(tree: Any, path: tuple[Any, ...]) -> bool:
+    """Whether each colour channel of the leaf of `tree` at a path acts on that channel of a picture alone."""
+    return _declared_at(tree, path).get("by_channel", False)
+
+
+def _declared_at(tree: Any, path: tuple[Any, ...]) -> dict[str, Any]:
+    """The metadata of the innermost field along a path that declares a range."""
+    found: dict[str, Any] = {}
     for key in path:
         if isinstance(key, jax.tree_util.GetAttrKey):
-            declared = {f.name: f.metadata.get("range") for f in dataclasses.fields(tree)}
-            found, tree = declared.get(key.name) or found, getattr(tree, key.name)
+            declared = {f.name: dict(f.metadata) for f in dataclasses.fields(tree) if "range" in f.metadata}
+            found, tree = declared.get(key.name, found), getattr(tree, key.name)
         else:
             tree = tree[key.key if isinstance(key, jax.tree_util.DictKey) else key.idx]
     return found
