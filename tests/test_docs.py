@@ -150,6 +150,8 @@ def test_the_reference_has_every_public_name():
     for name in PUBLIC:
         assert re.search(rf"^:+{{py:\w+}} jvr\.{name}(?!\w)", text, re.MULTILINE), name
         assert getattr(jvr, name).__doc__, name
+    assert "attenuation=None" in text
+    assert "settings=Settings()" in text
     assert "py:function} jvr.sh.project(" in text
     assert "py:function} jvr.presets.ct()" in text
     assert "py:classmethod} look_at(eye, target, up, fov_y, width, height)" in text
