@@ -34,6 +34,12 @@ def test_every_block_names_its_language():
     assert {block.language for block in pages.blocks()} <= LANGUAGES
 
 
+def test_tables_are_read_as_tables():
+    """A row that follows an empty line is text."""
+    lines = {f"{page}:{t.map[0] + 1}" for page, text in PAGES.items() for t in pages.PARSER.parse(text) if t.content[:1] == "|"}
+    assert lines == set()
+
+
 def test_what_is_not_run_is_known():
     assert {block.place: block.not_run for block in pages.blocks() if block.not_run} == {}
 
