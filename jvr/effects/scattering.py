@@ -1,6 +1,7 @@
 """Single scattering: light that the medium scatters once on its way to the eye (course notes on GPU-based volume ray-casting,
 Eurographics 2009, chapters 7.1 to 7.4)."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,7 @@ from jvr.effects.shading import surface_weight
 from jvr.model.by_value import ByValue, coefficient
 from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractScattering
+from jvr.model.parts import is_zero
 from jvr.model.phase import AbstractPhase, Isotropic, ScatteringAngle
 from jvr.model.ranges import POSITIVE, UNIT_INTERVAL, within
 from jvr.types import ArrayLike, Channels, Scalar, Triple
@@ -52,6 +54,10 @@ class SingleScattering(AbstractScattering):
         self.threshold = None if threshold is None else float_array(threshold, "threshold", ())
         if threshold is not None:
             require(self.threshold, POSITIVE.holds, "threshold must be a positive length of the gradient, or None")
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        if is_zero(self.albedo):
+            yield "scattering.albedo is zero everywhere: nothing is scattered"
 
     @property
     def needs_gradient(self) -> bool:

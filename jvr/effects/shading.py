@@ -5,6 +5,7 @@ The normal points from larger to smaller values. Visualization convention: a lig
 colour of the transfer function; the cosine is that of the angle between normal and light.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float
 from jvr.model.by_value import ByValue, coefficient
 from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractShading
+from jvr.model.parts import is_zero
 from jvr.model.ranges import NOT_NEGATIVE, Interval, within
 from jvr.numerics import direction_and_length, divide_or_zero, dot, larger, power_of_cosine, smaller
 from jvr.types import ArrayLike, Scalar, Triple
@@ -55,6 +57,10 @@ class Lambert(AbstractShading):
         self.threshold = float_array(threshold, "threshold", ())
         require(self.threshold, NOT_NEGATIVE.holds, "threshold must be a length of the gradient, not negative")
         self.two_sided = two_sided
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        if is_zero(self.diffuse) and is_zero(getattr(self, "specular", 0.0)):
+            yield "shading.diffuse and shading.specular are zero: nothing but ambient light is reflected"
 
     def ambient_reflectance(self) -> Scalar:
         return self.ambient

@@ -1,6 +1,7 @@
 """Transfer functions of the scalar and of the length of its gradient (Kniss, Kindlmann and Hansen 2002; Levoy 1988)."""
 
-from typing import ClassVar
+import dataclasses
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -84,6 +85,12 @@ class GradientOpacity(AbstractTransfer):
             lambda v: NOT_NEGATIVE.holds(v) & (v[0] < v[1]),
             "GradientOpacity needs 0 <= low < high",
         )
+
+    def title(self, name: str, scene: Any) -> str:
+        return "gradient opacity"
+
+    def without(self, scene: Any) -> Any:
+        return dataclasses.replace(scene, transfer=self.transfer)
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         assert magnitude is not None

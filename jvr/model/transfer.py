@@ -1,7 +1,7 @@
 """Transfer functions: from the scalar `s` to colour and extinction."""
 
 import abc
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.checks import colours, float_array, require
+from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.ranges import EXTINCTION, INCREASING, POSITIVE, UNIT_INTERVAL, within
 from jvr.numerics import clamp, divide_or_zero, read_run
 from jvr.types import ArrayLike, Channels, Scalar, Triple
@@ -23,11 +24,20 @@ class Classified(NamedTuple):
     sigma_t: Channels
 
 
-class AbstractTransfer(eqx.Module):
+class AbstractTransfer(AbstractPart):
     """A map from the scalar `s` (in the data's own units) to source colour and extinction."""
 
     # Whether `evaluate` takes the length of the gradient (per world length) as well.
     takes_gradient: ClassVar[bool] = False
+
+    @property
+    def needs_gradient(self) -> bool:
+        return self.takes_gradient
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        arguments = (scene.volume.slope,) * (2 if self.takes_gradient else 1)
+        coloured = len(jax.eval_shape(self.evaluate, *arguments).sigma_t) == 3
+        return (PlanEntry(name, True, f"{type(self).__name__}, {'coloured' if coloured else 'grey'} extinction"),)
 
     @abc.abstractmethod
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
