@@ -195,7 +195,7 @@ def test_unknowns_are_told_apart_by_their_place():
     pick = lambda s: {"sigma_t": s.transfer.sigma_t, "more": (s.transfer.domain, s.transfer.rgb)}
     chosen = choose_unknowns(ExposedModel(scene, None), lambda m: pick(m.scene))
     # Dictionaries are flattened in the order of their keys.
-    assert chosen.names == ("scene.transfer.domain", "scene.transfer.rgb", "scene.transfer.sigma_t")
+    assert chosen.names == ("transfer.domain", "transfer.rgb", "transfer.sigma_t")
     assert len(set(chosen.indices)) == 3
     result = fit(scene, unknowns=pick, max_steps=1)
     assert result.unknowns == ("transfer.domain", "transfer.rgb", "transfer.sigma_t")

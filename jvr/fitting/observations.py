@@ -154,10 +154,10 @@ def observe(
     # Compiled for all cameras of one size and kind.
     rays = [_rays(scene, camera) for camera in cameras]
     length = np.concatenate([np.asarray(_inside(scene, one).length) for one in rays])
-    order = np.argsort(-length, kind="stable")
+    order = np.argsort(-length, kind="stable").astype(np.int32)
     chunk = min(chunk or CHUNK, -(-order.size // shares()))
     together = chunk * shares()
-    rank = np.arange(-(-order.size // together) * together).reshape(-1, shares()).T.reshape(-1, chunk)
+    rank = np.arange(-(-order.size // together) * together, dtype=np.int32).reshape(-1, shares()).T.reshape(-1, chunk)
     pixel = order[np.minimum(rank, order.size - 1)]
     structure = jax.tree.structure(rays[0])
     columns = [list(parts) for parts in zip(*map(jax.tree.leaves, rays), strict=True)]
