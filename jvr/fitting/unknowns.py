@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.fitting.bijectors import AbstractBijector, bijector_of
-from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range, range_at, within
+from jvr.model.parameters import parameter
+from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range, range_at
 from jvr.model.scene import Scene
 from jvr.types import Scalar
 
@@ -19,7 +20,7 @@ class ExposedModel(eqx.Module):
     """A scene and the factor between its radiance and the target images' (`None` where they are in the same unit)."""
 
     scene: Scene
-    exposure: Scalar | None = eqx.field(metadata=within(NOT_NEGATIVE))
+    exposure: Scalar | None = parameter(NOT_NEGATIVE, doc="factor between radiance and the images")
 
 
 class Unknowns(eqx.Module):

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from jvr.model import harmonics
 from jvr.model.checks import float_array, known, radiances, require
 from jvr.model.harmonics.projection import cap
+from jvr.model.parameters import assign, choice, parameter
 from jvr.model.ranges import NOT_NEGATIVE
 from jvr.numerics import normalise
 from jvr.pictures import as_radiance
@@ -28,14 +29,12 @@ class EnvironmentLight(eqx.Module):
     Sums of environments are environments: `probe + EnvironmentLight.disc(...)`.
     """
 
-    coefficients: Float[Array, "bands 3"]
-    clamped: bool = eqx.field(static=True)
+    coefficients: Float[Array, "bands 3"] = parameter(doc="of the harmonics, red, green, blue")
+    clamped: bool = choice(doc="whether negative radiance is cut off")
 
     def __init__(self, coefficients: ArrayLike, *, clamped: bool = True):
-        self.coefficients = float_array(coefficients, "coefficients", (None, 3))
-        require(self.coefficients, np.isfinite, "the coefficients of an environment must be finite")
+        assign(self, coefficients=coefficients, clamped=clamped)
         harmonics.order_of(self.coefficients)
-        self.clamped = bool(clamped)
 
     @classmethod
     def from_image(

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jvr.model.parameters import choice
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Nearest, Trilinear, Volume, gradients_at_voxels
 from jvr.numerics import add_runs, divide_or_zero, read_run
@@ -28,7 +29,7 @@ class AbstractNormals(eqx.Module):
     """A gradient estimator. With `of_opacity` it is that of the extinction, after the transfer function (mean of its channels),
     else that of the scalar."""
 
-    of_opacity: bool = eqx.field(static=True, default=False)
+    of_opacity: bool = choice(doc="whether of the extinction, not of the scalar", default=False)
 
     @abc.abstractmethod
     def resample(self, volume: Volume, p: Triple) -> Resampled:

@@ -7,21 +7,21 @@ from typing import Any
 import numpy as np
 
 from jvr.io.config.errors import blame
-from jvr.io.config.light import phase_of
 from jvr.io.config.load import Config
+from jvr.io.config.parts import made
 from jvr.io.config.schema.environment import (
     AnyEnvironment,
-    AnyMaterial,
     DipoleTable,
     ImageTable,
     MaterialsTable,
+    MaterialTable,
     MerlTable,
-    PhaseMaterialTable,
     RadianceTransferTable,
     RotationTable,
 )
 from jvr.model.effects import AbstractMaterial
 from jvr.model.environment import EnvironmentLight
+from jvr.model.material import AbstractBRDF
 from jvr.model.scene import Scene, material_order
 
 Precompute = Callable[..., Scene]
@@ -105,7 +105,7 @@ def _rotation(turns: list[RotationTable]) -> np.ndarray:
     return matrix
 
 
-def _material(config: Config, table: AnyMaterial | MaterialsTable, order: int) -> AbstractMaterial:
+def _material(config: Config, table: MaterialTable | MaterialsTable, order: int) -> AbstractMaterial:
     if not isinstance(table, MaterialsTable):
         return _one_material(config, "material", table, order, table.threshold)
     from jvr.model.material import MaterialByValue
@@ -113,40 +113,25 @@ def _material(config: Config, table: AnyMaterial | MaterialsTable, order: int) -
     threshold = table.materials[0].threshold
     parts = [_one_material(config, f"material.materials[{i}]", m, order, threshold) for i, m in enumerate(table.materials)]
     with blame(config.where("material"), "material"):
-        made = MaterialByValue(table.positions, parts)
+        found = MaterialByValue(table.positions, parts)
         # Materials that have no place beside each other say so when they are joined.
-        made.projected(0)
-        return made
+        found.projected(0)
+        return found
 
 
-def _one_material(config: Config, key: str, table: AnyMaterial, order: int, threshold: float | None) -> AbstractMaterial:
+def _one_material(config: Config, key: str, table: MaterialTable, order: int, threshold: float | None) -> AbstractMaterial:
+    brdf = _measured(config, key, table) if isinstance(table, MerlTable) else made(config, key, table, "threshold")
+    if threshold is None:
+        return brdf
+    from jvr.model.material import HarmonicMaterial
+
     with blame(config.where(key), key):
-        brdf = _brdf(config, key, table)
-        if threshold is None:
-            return brdf
-        from jvr.model.material import HarmonicMaterial
-
         return HarmonicMaterial.project(brdf, order, threshold=threshold)
 
 
-def _brdf(config: Config, key: str, table: AnyMaterial) -> Any:
-    from jvr.model import brdf
-
-    keywords = {name: value for name, value in table.given().items() if name not in ("threshold", "source")}
-    if isinstance(table, MerlTable):
-        from jvr.model.merl import MerlBRDF
-
-        with blame(config.where(f"{key}.path"), f"{key}.path"):
-            return MerlBRDF.read(config.find(table.path, f"{key}.path", table.source))
-    if isinstance(table, PhaseMaterialTable):
-        with blame(config.where(f"{key}.phase"), f"{key}.phase"):
-            keywords["phase"] = phase_of(config, f"{key}.phase", table.phase)
-        return brdf.PhaseBRDF(**keywords)
-    if table.kind == "microfacet":
-        from jvr.model.microfacet import MicrofacetBRDF
-
-        return MicrofacetBRDF(**keywords)
-    return {"lambert": brdf.LambertBRDF, "phong": brdf.PhongBRDF, "blinn-phong": brdf.BlinnPhongBRDF}[table.kind](**keywords)
+def _measured(config: Config, key: str, table: MerlTable) -> AbstractBRDF:
+    with blame(config.where(f"{key}.path"), f"{key}.path"):
+        return table.part(config.find(table.path, f"{key}.path", table.source))
 
 
 def _radiance_transfer(config: Config, table: RadianceTransferTable) -> Any:

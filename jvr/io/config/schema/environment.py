@@ -3,18 +3,19 @@
 A parameter that is left out has the default of its class in jvr.
 """
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from jvr.io.config.checks import number, number_or_triple, numbers, problem, whole
-from jvr.io.config.schema.light import Phase
+from jvr.io.config.schema.parts import BASES, WRITTEN, PartTable, part
 from jvr.io.config.schema.table import Position, Positions, Steepness, Table, named
+from jvr.model.material import AbstractBRDF
+from jvr.model.ranges import AT_LEAST_ONE, DEGREES, NOT_NEGATIVE, POSITIVE, TRANSMITTANCE, UNIT_INTERVAL, Interval
 
-Radiance = Annotated[Any, number_or_triple("radiance", 0.0)]
-Order = Annotated[int, whole("order of the harmonics", 0, 10)]
-Share = Annotated[Any, number_or_triple("share of the light", 0.0, 1.0)]
-Fraction = Annotated[float, number("from 0 for none to 1 for all", 0.0, 1.0)]
+Radiance = Annotated[Any, number_or_triple("radiance", NOT_NEGATIVE)]
+Order = Annotated[int, whole("order of the harmonics", Interval(0, 10))]
 
 
 class RotationTable(Table):
@@ -50,9 +51,9 @@ class ImageTable(AroundTable):
     kind: Literal["image"]
     path: str
     source: str | None = None
-    scale: Annotated[float, number("factor between the map's radiance and the scene's", 0.0)] = 1.0
+    scale: Annotated[float, number("factor between the map's radiance and the scene's", NOT_NEGATIVE)] = 1.0
     order: Order | None = None
-    window: Annotated[float, number("band from which nothing is left", 0.0, inner=True)] | None = None
+    window: Annotated[float, number("band from which nothing is left", POSITIVE)] | None = None
 
 
 class ConstantTable(AroundTable):
@@ -68,7 +69,7 @@ class RoundTable(AroundTable):
 
     kind: Literal["disc"]
     towards: Annotated[list[float], numbers(3, "x, y, z, from the scene to the light")]
-    half_angle: Annotated[float, number("degrees from the middle to the rim", 0.0, 180.0)]
+    half_angle: Annotated[float, number("degrees from the middle to the rim", DEGREES)]
     radiance: Radiance | None = None
     order: Order | None = None
 
@@ -82,56 +83,27 @@ AnyEnvironment = ImageTable | ConstantTable | RoundTable
 Environments = Annotated[list[Annotated[AnyEnvironment, Field(discriminator="kind")]], BeforeValidator(_environments)]
 
 
-class OneMaterialTable(Table):
+class MaterialTable(PartTable):
     """What all materials have. With a threshold they are projected on harmonics when the file is read."""
 
     threshold: Steepness | None = None
 
 
-class LambertBRDFTable(OneMaterialTable):
-    """`jvr.LambertBRDF`."""
-
-    kind: Literal["lambert"]
-    reflectance: Share | None = None
-
-
-class PhongBRDFTable(OneMaterialTable):
-    """`jvr.PhongBRDF` or `jvr.BlinnPhongBRDF`."""
-
-    kind: Literal["phong", "blinn-phong"]
-    diffuse: Share | None = None
-    specular: Share | None = None
-    exponent: Annotated[float, number("exponent of the highlight", 0.0)] | None = None
-
-
-class MicrofacetTable(OneMaterialTable):
-    """`jvr.MicrofacetBRDF`."""
-
-    kind: Literal["microfacet"]
-    base: Share | None = None
-    metallic: Fraction | None = None
-    roughness: Annotated[float, number("0.001 for a mirror, 1 for matte", 0.001, 1.0)] | None = None
-    reflectance_at_normal: Share | None = None
-
-
-class PhaseMaterialTable(OneMaterialTable):
-    """`jvr.PhaseBRDF`."""
-
-    kind: Literal["phase"]
-    phase: Phase
-    albedo: Share | None = None
-
-
-class MerlTable(OneMaterialTable):
+class MerlTable(MaterialTable):
     """`jvr.MerlBRDF.read`."""
 
-    kind: Literal["merl"]
     path: str
     source: str | None = None
 
+    @staticmethod
+    def part(path: Path) -> Any:
+        from jvr.model.merl import MerlBRDF
 
-AnyMaterial = LambertBRDFTable | PhongBRDFTable | MicrofacetTable | PhaseMaterialTable | MerlTable
-OneMaterial = Annotated[AnyMaterial, Field(discriminator="kind"), BeforeValidator(named)]
+        return MerlBRDF.read(path)
+
+
+BASES[AbstractBRDF], WRITTEN[AbstractBRDF] = MaterialTable, {"merl": MerlTable}
+OneMaterial = Annotated[Any, part(AbstractBRDF)]
 
 
 class MaterialsTable(Table):
@@ -162,11 +134,9 @@ class DipoleTable(Table):
     """`jvr.Dipole`, or one of its presets."""
 
     preset: str | None = None
-    sigma_s_prime: (
-        Annotated[list[float], numbers(3, "reduced scattering in 1 / mm, red, green, blue", 0.0, inner=True)] | None
-    ) = None
-    sigma_a: Annotated[list[float], numbers(3, "absorption in 1 / mm, red, green, blue", 0.0)] | None = None
-    eta: Annotated[float, number("index of refraction", 1.0, 3.0)] | None = None
+    sigma_s_prime: Annotated[list[float], numbers(3, "reduced scattering in 1 / mm, red, green, blue", POSITIVE)] | None = None
+    sigma_a: Annotated[list[float], numbers(3, "absorption in 1 / mm, red, green, blue", NOT_NEGATIVE)] | None = None
+    eta: Annotated[float, number("index of refraction", Interval(1.0, 3.0))] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "DipoleTable":
@@ -186,18 +156,18 @@ class RadianceTransferTable(Table):
     """`jvr.RadianceTransfer`. `frozen`: whether a fit keeps what was computed for its start though its unknowns change it."""
 
     order: Order | None = None
-    rays: Annotated[int, whole("rays for each node", 1)] | None = None
-    resolution: Annotated[float, number("nodes for each voxel along an axis", 0.0, 1.0)] | None = None
+    rays: Annotated[int, whole("rays for each node", AT_LEAST_ONE)] | None = None
+    resolution: Annotated[float, number("nodes for each voxel along an axis", UNIT_INTERVAL)] | None = None
     bleeding: Literal["transfer", "material"] | None = None
     scattering: Annotated[DipoleTable, BeforeValidator(_dipole)] | None = None
-    neighbourhood: Annotated[float, number("radius as a share of the longest side", 0.0, 1.0)] | None = None
+    neighbourhood: Annotated[float, number("radius as a share of the longest side", UNIT_INTERVAL)] | None = None
     exact: bool | None = None
     chromaticity: Order | None = None
-    step: Annotated[float, number("first step in voxels", 0.0, inner=True)] | None = None
-    growth: Annotated[float, number("ratio of a step to the one before", 1.0)] | None = None
-    termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", 0.0, 0.999)] | None = None
-    surface: Annotated[float, number("change of transparency between nodes", 0.0, inner=True)] | None = None
-    memory: Annotated[float, number("bytes", 0.0, inner=True)] | None = None
+    step: Annotated[float, number("first step in voxels", POSITIVE)] | None = None
+    growth: Annotated[float, number("ratio of a step to the one before", AT_LEAST_ONE)] | None = None
+    termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", TRANSMITTANCE)] | None = None
+    surface: Annotated[float, number("change of transparency between nodes", POSITIVE)] | None = None
+    memory: Annotated[float, number("bytes", POSITIVE)] | None = None
     frozen: bool = True
 
     @model_validator(mode="after")

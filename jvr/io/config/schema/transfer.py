@@ -6,6 +6,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from jvr.io.config.checks import increasing, number, numbers, problem, whole
 from jvr.io.config.schema.table import Colour, Extinction, Extinctions, Positions, Range, Scalar, Steepness, Table
+from jvr.model.ranges import NOT_NEGATIVE, POSITIVE, Interval
 
 
 class GradientOpacityTable(Table):
@@ -54,7 +55,7 @@ class GaussianTable(OfScalarTable):
 
     kind: Literal["gaussian"]
     center: Annotated[list[float], numbers(None, "in the data's own units"), Field(min_length=1)]
-    width: Annotated[list[float], numbers(None, "in the data's own units", 0.0, inner=True)]
+    width: Annotated[list[float], numbers(None, "in the data's own units", POSITIVE)]
     height: Extinctions
     rgb: list[Colour]
 
@@ -69,7 +70,7 @@ class GaussianPart(Table):
 
     kind: Literal["gaussian"]
     center: Scalar
-    width: Annotated[float, number("in the data's own units", 0.0, inner=True)]
+    width: Annotated[float, number("in the data's own units", POSITIVE)]
     height: Extinction
 
 
@@ -88,7 +89,7 @@ class SampledTable(OfScalarTable):
     """A `jvr.LutTransfer` with extinction summed from parts and colours blended smoothly between a few."""
 
     kind: Literal["sampled"]
-    entries: Annotated[int, whole("entries of the table", 2, 65_536)]
+    entries: Annotated[int, whole("entries of the table", Interval(2, 65_536))]
     domain: Range
     positions: Positions
     rgb: list[Colour]
@@ -105,7 +106,7 @@ class GradientTable(Table):
 
     kind: Literal["gradient"]
     domain: Range
-    magnitudes: Annotated[list[float], numbers(2, "low, high in data units per mm", 0.0), AfterValidator(increasing)]
+    magnitudes: Annotated[list[float], numbers(2, "low, high in data units per mm", NOT_NEGATIVE), AfterValidator(increasing)]
     rgb: Annotated[list[list[Colour]], Field(min_length=2)]
     sigma_t: list[Extinctions]
 
@@ -144,7 +145,7 @@ class WindowTable(OfScalarTable):
     """`jvr.presets.window_level`; without window and level they come from the volume's values."""
 
     kind: Literal["window"]
-    window: Annotated[float, number("width in the data's own units", 0.0, inner=True)] | None = None
+    window: Annotated[float, number("width in the data's own units", POSITIVE)] | None = None
     level: Scalar | None = None
     sigma_t: Extinction | None = None
     rgb: Colour = Field(default=[1.0, 1.0, 1.0])
