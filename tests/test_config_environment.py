@@ -318,37 +318,7 @@ def test_a_white_furnace_is_white():
     assert math.isclose(float(jnp.max(jnp.abs(picture.rgb - 1))), 0, abs_tol=1e-3)
 
 
-# --- documentation ---------------------------------------------------------------------------------------------------
-
-PAGE = (Path(__file__).parents[1] / "docs" / "environment_lighting.md").read_text(encoding="utf-8")
-
-
-def test_the_config_of_the_documentation_is_valid():
-    made = scene_of(PAGE.split("```toml\n")[1].split("```")[0] + BASE)
-    assert isinstance(made.material, jvr.MaterialByValue)
-    assert made.environment.order == 3
-    assert isinstance(made.radiance_transfer.scattering, jvr.Dipole)
-
-
-@pytest.mark.slow
-def test_the_example_of_the_documentation_runs(sky, tmp_path, monkeypatch):
-    """With small files in place of the named ones, and a small picture."""
-    monkeypatch.chdir(tmp_path)
-    values = np.random.default_rng(0).uniform(-500, 1500, (6, 7, 8)).astype(np.float32)
-    np.save(tmp_path / "head.npy", values)
-    code = PAGE.split("```python\n")[1].split("```")[0]
-    for name, other in (
-        ("head.nii.gz", "head.npy"),
-        ("potsdamer_platz_1k.hdr", "sky.exr"),
-        ("studio_small_03_1k.hdr", "sky.exr"),
-        ("128, 128", "4, 4"),
-    ):
-        assert name in code
-        code = code.replace(name, other)
-    found = {}
-    exec(code, found)
-    assert np.all(np.isfinite(found["relit"].rgb))
-    assert np.any(np.asarray(found["relit"].rgb) != np.asarray(found["image"].rgb))
+# --- configurations of the repository ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["natural_light.toml", "real/ct_head_natural.toml"])

@@ -351,15 +351,3 @@ def test_a_lit_configuration_renders():
     picture = jvr.render(scene, camera, jvr.Settings(4.0))
     assert bool(jnp.all(jnp.isfinite(picture.rgb)))
     assert float(picture.rgb.max()) > 0.0
-
-
-@pytest.mark.slow
-def test_the_examples_of_the_documentation_are_valid():
-    text = (Path(__file__).parents[1] / "docs" / "files.md").read_text(encoding="utf-8")
-    lit, fit, *_ = (block.split("```")[0] for block in text.split("```toml\n")[1:])
-    scene = scene_of(BASE + lit)
-    assert len(scene.lights) == 17
-    fitted = config(
-        BASE.replace("transfer", "truth") + lit + fit, "camera={width=2,height=2}", "settings.step=16", "lights.1.samples=1"
-    )
-    assert float(build_fit(fitted).scene.scattering.phase.g) == 0.0

@@ -388,16 +388,6 @@ def test_numbers_and_kinds_can_be_edited(files):
     np.testing.assert_array_equal(found.phase.phases[3].k.values, np.float32([0.1, 0.2]))
 
 
-def test_the_example_of_the_documentation_is_valid(tmp_path):
-    text = (Path(__file__).parents[1] / "docs" / "files.md").read_text(encoding="utf-8")
-    (example,) = (block for block in text.split("```toml\n") if 'kind = "LinearTransfer"' in block)
-    jvr.save_scene(lit(), tmp_path / "a.toml")
-    edit(tmp_path / "a.toml", r"^\[transfer\](.|\n)*?\n\n", example.split("```")[0] + "\n")
-    found = jvr.load_scene(tmp_path / "a.toml")
-    np.testing.assert_array_equal(found.transfer.positions, [0, 300])
-    assert found.shadows == jvr.ShadowRays()
-
-
 def test_what_is_left_out_has_the_default_of_its_class(files):
     edit(files, r"^albedo = .*", "")
     edit(files, r"^threshold = .*", "")
