@@ -274,7 +274,7 @@ def test_a_transfer_function_of_the_gradient_survives_a_file_bit_by_bit(transfer
         ("transfer.gradient_opacity={lo=0,high=1}", "transfer.gradient_opacity.lo", "did you mean 'low'?"),
         ("transfer.gradient_opacity={low=1,high=1}", "transfer.gradient_opacity", "low < high"),
         (f"transfer={GRADIENT.replace('[0,1,2]', '[0,1]')}", "transfer.sigma_t[0]", "2 entries"),
-        (f"transfer={GRADIENT.replace('magnitudes=[0,', 'magnitudes=[-1,')}", "transfer.magnitudes", "not negative"),
+        (f"transfer={GRADIENT.replace('magnitudes=[0,', 'magnitudes=[1,')}", "transfer.magnitudes", "strictly increasing"),
     ],
 )
 def test_mistakes_about_light_are_named(change, key, hint):

@@ -18,7 +18,7 @@ from jaxtyping import Array, UInt32
 
 from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
 from jvr.model.dipole import Dipole
-from jvr.model.effects import AbstractRadianceTransfer
+from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
 from jvr.model.harmonics.basis import count
 from jvr.model.kept import content
 from jvr.model.parameters import assign, choice, parameter
@@ -34,12 +34,12 @@ ORDER = Interval(0.0, 10.0)
 SHARE = Interval(0.0, 1.0, "(]")
 
 
-class TransferBleeding(eqx.Module):
+class TransferBleeding(AbstractBleeding):
     """Colour bleeding of the transfer function's colours, which rays pick up of what they pass: materials may be exchanged without a new
     projection."""
 
 
-class MaterialBleeding(eqx.Module):
+class MaterialBleeding(AbstractBleeding):
     """Colour bleeding of what the material reflects towards the origin of a ray, times the transfer function's colour where that tints
     it: a new material needs a new projection."""
 
@@ -80,7 +80,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
     order: int = choice(ORDER, doc="order of the harmonics")
     rays: int = choice(AT_LEAST_ONE, doc="rays for each node")
     resolution: float = choice(SHARE, doc="nodes for each voxel along an axis")
-    bleeding: TransferBleeding | MaterialBleeding | None = parameter(doc="jvr.TransferBleeding(), jvr.MaterialBleeding() or None")
+    bleeding: AbstractBleeding | None = parameter(doc="jvr.TransferBleeding(), jvr.MaterialBleeding() or None")
     scattering: Dipole | None = parameter(doc='a jvr.Dipole, such as jvr.Dipole.preset("skin1"), or None')
     neighbourhood: float = choice(SHARE, doc="radius as a share of the longest side")
     exact: bool = choice(doc="whether samples take the triple product")
@@ -98,8 +98,8 @@ class RadianceTransfer(AbstractRadianceTransfer):
         rays: int = 64,
         resolution: float | int = 1 / 3,
         *,
-        bleeding: TransferBleeding | MaterialBleeding | None = None,
-        scattering: Any = None,
+        bleeding: AbstractBleeding | None = None,
+        scattering: Dipole | None = None,
         neighbourhood: float | int = 0.1,
         exact: bool = False,
         chromaticity: int | None = None,

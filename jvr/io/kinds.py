@@ -1,15 +1,22 @@
 """Classes that files may name: in configurations by a kind, such as "henyey-greenstein", in saved scenes by their name.
 
-Nothing else is ever imported or called for a file. A class of your own joins them by one line, `jvr.register("ring", RingLight)`.
+Nothing else is ever imported or called for a file. A class of your own joins them by one line, `jvr.register("ring", cls)`.
 """
 
 import importlib
 
-from jvr.model.effects import AbstractScattering, AbstractShading, AbstractShadows
+from jvr.model.effects import (
+    AbstractBleeding,
+    AbstractRadianceTransfer,
+    AbstractScattering,
+    AbstractShading,
+    AbstractShadows,
+)
 from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
 from jvr.model.phase import AbstractPhase
+from jvr.model.transfer import AbstractTransfer
 from jvr.names import NAMES
 
 # Public classes that a scene is made of, by name: the module that is imported when a file names one, or a class that was registered.
@@ -56,6 +63,14 @@ KINDS: dict[type, dict[str, str]] = {
         "sobel": "SobelDifferences",
         "precomputed": "PrecomputedGradient",
     },
+    AbstractRadianceTransfer: {"projected": "RadianceTransfer"},
+    AbstractTransfer: {
+        "linear": "LinearTransfer",
+        "lut": "LutTransfer",
+        "gaussian": "GaussianTransfer",
+        "gradient": "GradientTransfer",
+    },
+    AbstractBleeding: {"transfer": "TransferBleeding", "material": "MaterialBleeding"},
     AbstractBRDF: {
         "lambert": "LambertBRDF",
         "phong": "PhongBRDF",
@@ -67,12 +82,12 @@ KINDS: dict[type, dict[str, str]] = {
 
 
 def register(kind: str, cls: type) -> None:
-    """Makes a class of your own known to files, in one line: `jvr.register("ring", RingLight)`.
+    """Makes a class of your own known to files, in one line: `jvr.register("ring", cls)`.
 
-    The class is a light, phase function, shading, shadow algorithm, scattering, gradient estimator or BRDF, whose constructor's arguments
-    are parameters declared beside its fields (`jvr.model.parameters`). It can then be named in a configuration, `kind = "ring"`, with a
-    key for each of them, and `jvr.save_scene` and `jvr.load_scene` write and read it by the name of its class. Registering a class of the
-    same name and kind again, as a notebook does, replaces it.
+    The class is a light, phase function, transfer function, shading, shadow algorithm, scattering, gradient estimator or BRDF, whose
+    constructor's arguments are parameters declared beside its fields (`jvr.model.parameters`). It can then be named in a configuration,
+    `kind = "ring"`, with a key for each of them, and `jvr.save_scene` and `jvr.load_scene` write and read it by the name of its class.
+    Registering a class of the same name and kind again, as a notebook does, replaces it.
 
     **Raises** `TypeError` for a class of no such family, `ValueError` for a kind or name that another class has.
     """

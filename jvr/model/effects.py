@@ -74,6 +74,10 @@ class AbstractMaterial(eqx.Module):
         """The same as a `jvr.HarmonicMaterial`, of this order unless it has been projected before."""
 
 
+class AbstractBleeding(eqx.Module):
+    """Colour bleeding: what rays of a radiance transfer pick up on their way."""
+
+
 class AbstractRadianceTransfer(eqx.Module):
     """Radiance transfer: how the medium around a point changes the light of the environment that reaches it."""
 

@@ -11,7 +11,6 @@ from jvr.io.config.load import Config
 from jvr.io.config.parts import made
 from jvr.io.config.schema.environment import (
     AnyEnvironment,
-    DipoleTable,
     ImageTable,
     MaterialsTable,
     MaterialTable,
@@ -31,8 +30,7 @@ def environment_parts(config: Config) -> dict[str, Any]:
     """What a configuration says about environment lighting, as keywords of `jvr.Scene`."""
     tables, parts = config.tables, {}
     if tables.radiance_transfer is not None:
-        with blame(config.where("radiance_transfer"), "radiance_transfer"):
-            parts["radiance_transfer"] = _radiance_transfer(config, tables.radiance_transfer)
+        parts["radiance_transfer"] = made(config.where, "radiance_transfer", tables.radiance_transfer, "frozen")
     if tables.environment:
         several = len(tables.environment) > 1
         keys = [f"environment[{i}]" if several else "environment" for i in range(len(tables.environment))]
@@ -61,7 +59,12 @@ def keeps_radiance_transfer(config: Config) -> bool:
 
 def _shapes_radiance_transfer(table: RadianceTransferTable) -> tuple[str, ...]:
     """Parts of the scene that radiance transfer is computed from."""
-    return ("transfer", "volume", "clipping", *(["material"] if table.bleeding == "material" else []))
+    return (
+        "transfer",
+        "volume",
+        "clipping",
+        *(["material"] if table.bleeding is not None and table.bleeding.kind == "material" else []),
+    )
 
 
 def fit_scene(config: Config, scene: Scene, precompute: Precompute) -> Scene:
@@ -120,7 +123,7 @@ def _material(config: Config, table: MaterialTable | MaterialsTable, order: int)
 
 
 def _one_material(config: Config, key: str, table: MaterialTable, order: int, threshold: float | None) -> AbstractMaterial:
-    brdf = _measured(config, key, table) if isinstance(table, MerlTable) else made(config, key, table, "threshold")
+    brdf = _measured(config, key, table) if isinstance(table, MerlTable) else made(config.where, key, table, "threshold")
     if threshold is None:
         return brdf
     from jvr.model.material import HarmonicMaterial
@@ -132,23 +135,3 @@ def _one_material(config: Config, key: str, table: MaterialTable, order: int, th
 def _measured(config: Config, key: str, table: MerlTable) -> AbstractBRDF:
     with blame(config.where(f"{key}.path"), f"{key}.path"):
         return table.part(config.find(table.path, f"{key}.path", table.source))
-
-
-def _radiance_transfer(config: Config, table: RadianceTransferTable) -> Any:
-    from jvr.effects.radiance_transfer import MaterialBleeding, RadianceTransfer, TransferBleeding
-
-    keywords = table.given()
-    keywords.pop("frozen")
-    if table.bleeding is not None:
-        keywords["bleeding"] = TransferBleeding() if table.bleeding == "transfer" else MaterialBleeding()
-    if table.scattering is not None:
-        key = "radiance_transfer.scattering"
-        with blame(config.where(key), key):
-            keywords["scattering"] = _dipole(table.scattering)
-    return RadianceTransfer(**keywords)
-
-
-def _dipole(table: DipoleTable) -> Any:
-    from jvr.model.dipole import Dipole
-
-    return Dipole(**table.given()) if table.preset is None else Dipole.preset(table.preset)

@@ -14,12 +14,12 @@ def light_parts(config: Config, transfer: AbstractTransfer) -> dict[str, Any]:
     """What a configuration says about light, as keywords of `jvr.Scene`."""
     tables, parts = config.tables, {}
     if tables.lights:
-        each = [made(config, f"lights[{i}]", table) for i, table in enumerate(tables.lights)]
+        each = [made(config.where, f"lights[{i}]", table) for i, table in enumerate(tables.lights)]
         # A luminous ball is many lights.
         parts["lights"] = tuple(light for one in each for light in (one if isinstance(one, tuple) else (one,)))
     for name in ("shading", "shadows", "scattering", "normals"):
         if getattr(tables, name) is not None:
-            parts[name] = made(config, name, getattr(tables, name))
+            parts[name] = made(config.where, name, getattr(tables, name))
     if transfer.takes_gradient and "normals" in parts and parts["normals"].of_opacity:
         key = "normals.of_opacity"
         raise ConfigError(config.where(key), key, "must be false: the transfer function takes the gradient of the scalar")

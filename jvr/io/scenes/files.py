@@ -34,8 +34,9 @@ def save_scene(scene: Scene, path: str | os.PathLike) -> None:
     Both files are replaced together, or none is.
 
     **Arguments:** `path`: ends in `.toml`.
-    **Raises** `TypeError` for a part whose class is neither jvr's own nor registered by `jvr.register`, and for arrays that are being traced; `ValueError` for another ending,
-    and for a scene that its constructors would refuse, as `equinox.tree_at` can make one; `OSError` where a file cannot be written.
+    **Raises** `TypeError` for a part whose class is neither jvr's own nor registered by `jvr.register`, and for arrays that are being
+    traced; `ValueError` for another ending, and for a scene that its constructors would refuse, as `equinox.tree_at` can make one;
+    `OSError` where a file cannot be written.
     """
     path = _named(path)
     if type(scene) is not Scene:

@@ -6,13 +6,14 @@ A parameter that is left out has the default of its class in jvr.
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, PlainValidator, Tag, model_validator
 
 from jvr.io.config.checks import number, number_or_triple, numbers, problem, whole
-from jvr.io.config.schema.parts import BASES, WRITTEN, PartTable, part
-from jvr.io.config.schema.table import Position, Positions, Steepness, Table, named
+from jvr.io.config.schema.parts import BASES, WRITTEN, PartTable, checked_table, part, table_of
+from jvr.io.config.schema.table import Positions, Steepness, Table, named
+from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
 from jvr.model.material import AbstractBRDF
-from jvr.model.ranges import AT_LEAST_ONE, DEGREES, NOT_NEGATIVE, POSITIVE, TRANSMITTANCE, UNIT_INTERVAL, Interval
+from jvr.model.ranges import DEGREES, DIRECTION, NOT_NEGATIVE, POSITIVE, Interval
 
 Radiance = Annotated[Any, number_or_triple("radiance", NOT_NEGATIVE)]
 Order = Annotated[int, whole("order of the harmonics", Interval(0, 10))]
@@ -21,14 +22,8 @@ Order = Annotated[int, whole("order of the harmonics", Interval(0, 10))]
 class RotationTable(Table):
     """A turn about an axis of the world, counter-clockwise when the axis points to the viewer."""
 
-    axis: Position
+    axis: Annotated[list[float], numbers(3, "x, y, z, such as [0, 0, 1]", DIRECTION)]
     degrees: Annotated[float, number("angle in degrees")]
-
-    @model_validator(mode="after")
-    def _check(self) -> "RotationTable":
-        if not any(self.axis):
-            raise problem("must be a direction, such as [0, 0, 1], not zero", "axis")
-        return self
 
 
 def _one_or_more(value: Any) -> Any:
@@ -130,48 +125,44 @@ Material = Annotated[
 ]
 
 
-class DipoleTable(Table):
-    """`jvr.Dipole`, or one of its presets."""
+class TranslucentTable(PartTable):
+    """A preset of `jvr.Dipole`."""
 
-    preset: str | None = None
-    sigma_s_prime: Annotated[list[float], numbers(3, "reduced scattering in 1 / mm, red, green, blue", POSITIVE)] | None = None
-    sigma_a: Annotated[list[float], numbers(3, "absorption in 1 / mm, red, green, blue", NOT_NEGATIVE)] | None = None
-    eta: Annotated[float, number("index of refraction", Interval(1.0, 3.0))] | None = None
+    preset: str
 
-    @model_validator(mode="after")
-    def _check(self) -> "DipoleTable":
-        self._one_of("preset", "sigma_s_prime")
-        if self.preset is not None and (self.sigma_a is not None or self.eta is not None):
-            raise problem("excludes sigma_a and eta: a preset has its own", "preset")
-        if self.sigma_s_prime is not None and self.sigma_a is None:
-            raise problem("missing; give sigma_a beside sigma_s_prime", "sigma_a")
-        return self
+    @staticmethod
+    def part(preset: str) -> Any:
+        from jvr.model.dipole import Dipole
+
+        return Dipole.preset(preset)
 
 
-def _dipole(value: Any) -> Any:
-    return {"preset": value} if isinstance(value, str) else value
+def _dipole(value: Any) -> PartTable:
+    """A preset of `jvr.Dipole`, by its name or in a table, or its numbers."""
+    value = {"preset": value} if isinstance(value, str) else value
+    if isinstance(value, dict) and "preset" in value:
+        if len(value) > 1:
+            raise problem("excludes all other keys: a preset has its own sigma_s_prime, sigma_a and eta", "preset")
+        return checked_table(TranslucentTable, value)
+    from jvr.model.dipole import Dipole
+
+    return checked_table(table_of(Dipole), value)
 
 
-class RadianceTransferTable(Table):
-    """`jvr.RadianceTransfer`. `frozen`: whether a fit keeps what was computed for its start though its unknowns change it."""
+class RadianceTransferTable(PartTable):
+    """What a radiance transfer takes besides its own keys. `frozen`: whether a fit keeps what was computed for its start though its
+    unknowns change it."""
 
-    order: Order | None = None
-    rays: Annotated[int, whole("rays for each node", AT_LEAST_ONE)] | None = None
-    resolution: Annotated[float, number("nodes for each voxel along an axis", UNIT_INTERVAL)] | None = None
-    bleeding: Literal["transfer", "material"] | None = None
-    scattering: Annotated[DipoleTable, BeforeValidator(_dipole)] | None = None
-    neighbourhood: Annotated[float, number("radius as a share of the longest side", UNIT_INTERVAL)] | None = None
-    exact: bool | None = None
-    chromaticity: Order | None = None
-    step: Annotated[float, number("first step in voxels", POSITIVE)] | None = None
-    growth: Annotated[float, number("ratio of a step to the one before", AT_LEAST_ONE)] | None = None
-    termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", TRANSMITTANCE)] | None = None
-    surface: Annotated[float, number("change of transparency between nodes", POSITIVE)] | None = None
-    memory: Annotated[float, number("bytes", POSITIVE)] | None = None
+    bleeding: Annotated[Any, part(AbstractBleeding)] | None = None
+    scattering: Annotated[Any, PlainValidator(_dipole)] | None = None
     frozen: bool = True
 
     @model_validator(mode="after")
     def _check(self) -> "RadianceTransferTable":
-        if self.chromaticity is not None and self.bleeding is None:
+        if getattr(self, "chromaticity", None) is not None and self.bleeding is None:
             raise problem('is for light with a colour: add bleeding = "transfer" or "material"', "chromaticity")
         return self
+
+
+BASES[AbstractRadianceTransfer] = RadianceTransferTable
+RadianceTransfer = Annotated[Any, part(AbstractRadianceTransfer, "projected")]

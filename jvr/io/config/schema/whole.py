@@ -6,10 +6,12 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
-from jvr.io.config.schema.environment import Environments, Material, RadianceTransferTable
+from jvr.io.config.schema.environment import Environments, Material, RadianceTransfer
 from jvr.io.config.schema.light import Lights, Normals, Scattering, Shading, Shadows, casts_shadows
+from jvr.io.config.schema.parts import only
 from jvr.io.config.schema.table import Angle, Colour, Extinction, Length, Pixels, Position, Range, Scalar, Table, named
-from jvr.io.config.schema.transfer import TransferTable
+from jvr.io.config.schema.transfer import Transfer
+from jvr.model.clipping import ClippingBox
 from jvr.model.ranges import AT_LEAST_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, TRANSMITTANCE, UNIT_INTERVAL, Interval
 
 
@@ -41,13 +43,6 @@ class VolumeTable(Table):
     def _check(self) -> "VolumeTable":
         self._one_of("path", "builtin")
         return self
-
-
-class ClippingTable(Table):
-    """`jvr.ClippingBox`."""
-
-    lower: Position
-    upper: Position
 
 
 class CameraTable(Table):
@@ -230,11 +225,11 @@ class ConfigTable(Table):
     """A whole configuration."""
 
     volume: VolumeTable
-    transfer: TransferTable | None = None
-    truth: TransferTable | None = None
+    transfer: Transfer | None = None
+    truth: Transfer | None = None
     background: Colour | None = None
     optical: Literal["emission-absorption", "emission-only", "absorption-only"] = "emission-absorption"
-    clipping: ClippingTable | None = None
+    clipping: Annotated[Any, only(ClippingBox)] | None = None
     lights: Lights = Field(default=[])
     shading: Shading | None = None
     shadows: Shadows | None = None
@@ -242,7 +237,7 @@ class ConfigTable(Table):
     normals: Normals | None = None
     environment: Environments = Field(default=[])
     material: Material | None = None
-    radiance_transfer: RadianceTransferTable | None = None
+    radiance_transfer: RadianceTransfer | None = None
     camera: Cameras = Field(default=[PerspectiveTable(kind="perspective")])
     settings: SettingsTable = SettingsTable()
     fit: FitTable | None = None
