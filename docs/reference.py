@@ -117,7 +117,7 @@ class Shown:
     def __repr__(self) -> str:
         if isinstance(self.value, float):
             return f"{self.value:.6g}"
-        if self.value == default_of(type(self.value)):
+        if self.value is not None and self.value == default_of(type(self.value)):
             return f"{type(self.value).__name__}()"
         return re.sub(r",? \)", ")", re.sub(r"\s+", " ", repr(self.value)).replace("( ", "("))
 

@@ -176,7 +176,7 @@ def _labels(chosen: Unknowns, model: ExposedModel) -> list[str]:
     """A name for each number."""
     found = []
     for name, array in zip(chosen.names, chosen.values(model), strict=True):
-        short = name.removeprefix("scene.").removeprefix("scattering.")
+        short = name.removeprefix("scattering.")
         found += [short] if array.ndim == 0 else [f"{short}[{i}]" for i in range(array.size)]
     return found
 

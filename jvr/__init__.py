@@ -137,7 +137,9 @@ _MODULE_OF = {name: module for module, names in NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
+    if name == "__all__":
+        found = [*_MODULES, *_MODULE_OF]
+    elif name in _MODULES:
         found = importlib.import_module(_MODULES[name])
     elif name in _MODULE_OF:
         found = getattr(importlib.import_module(_MODULE_OF[name]), name)

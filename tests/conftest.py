@@ -8,8 +8,8 @@ os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "false")
 # Most of the time goes into compiling programs that run for a moment: a quarter of it without what makes them fast.
 CHEAP = "--xla_backend_optimization_level=0"
 if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
-    # Later compilers do not know this flag, and a flag that is not known ends the process.
-    CHEAP += " --xla_cpu_use_fusion_emitters=false"
+    # Later compilers do not know these flags, and a flag that is not known ends the process.
+    CHEAP += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 os.environ["XLA_FLAGS"] = f"{CHEAP} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 from jaxtyping import install_import_hook

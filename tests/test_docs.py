@@ -34,6 +34,12 @@ def test_every_block_names_its_language():
     assert {block.language for block in pages.blocks()} <= LANGUAGES
 
 
+def test_tables_are_read_as_tables():
+    """A row that follows an empty line is text."""
+    lines = {f"{page}:{t.map[0] + 1}" for page, text in PAGES.items() for t in pages.PARSER.parse(text) if t.content[:1] == "|"}
+    assert lines == set()
+
+
 def test_what_is_not_run_is_known():
     assert {block.place: block.not_run for block in pages.blocks() if block.not_run} == {}
 
@@ -150,6 +156,8 @@ def test_the_reference_has_every_public_name():
     for name in PUBLIC:
         assert re.search(rf"^:+{{py:\w+}} jvr\.{name}(?!\w)", text, re.MULTILINE), name
         assert getattr(jvr, name).__doc__, name
+    assert "attenuation=None" in text
+    assert "settings=Settings()" in text
     assert "py:function} jvr.sh.project(" in text
     assert "py:function} jvr.presets.ct()" in text
     assert "py:classmethod} look_at(eye, target, up, fov_y, width, height)" in text

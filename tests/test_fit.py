@@ -14,8 +14,10 @@ from scenes import perspective
 import jvr
 from jvr.fitting import checkpoint
 from jvr.fitting.identifiability import identifiability
-from jvr.fitting.objective import Problem, normal_equations, value
+from jvr.fitting.normal_equations import normal_equations
+from jvr.fitting.objective import value
 from jvr.fitting.observations import keep_samples, observe
+from jvr.fitting.problem import Problem
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 
 SETTINGS = jvr.Settings(step=0.7, termination=0.0)

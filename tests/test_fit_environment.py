@@ -10,8 +10,11 @@ import pytest
 from scenes import compiled
 
 import jvr
-from jvr.fitting.objective import Problem, has_table_jacobian, light_tangents, march_unknowns, normal_equations, value
+from jvr.fitting.kinds import has_table_jacobian, march_unknowns
+from jvr.fitting.normal_equations import light_tangents, normal_equations
+from jvr.fitting.objective import residuals, value
 from jvr.fitting.observations import observe
+from jvr.fitting.problem import Problem
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 
 SETTINGS = jvr.Settings(1.5)
@@ -143,6 +146,17 @@ def test_rows_refuse_light_that_changes_on_its_way(volume, unknown):
     image = lambda x: jvr.render(eqx.tree_at(select, one, x), camera, jvr.Settings(adjoint=jvr.Rows())).rgb
     with pytest.raises(ValueError, match="nor a radiance transfer or its light"):
         jax.eval_shape(jax.jacfwd(image), select(one))
+
+
+def test_least_squares_of_what_scatters_around_nodes_are_not_differentiated_by_rows(frozen):
+    """A dipole changes light on its way as the environment does, also where the radiance transfer itself is kept."""
+    scattering = lambda s: s.radiance_transfer.scattering
+    one = eqx.tree_at(scattering, frozen, jvr.Dipole.preset("cream"), is_leaf=lambda x: x is None)
+    problem, values = problem_of(one, lambda s: scattering(s).sigma_a)
+    cameras = jvr.fibonacci_sphere(one.volume.center, 16.0, 1, 34.0, 8, 8)
+    tiles = jax.tree.map(lambda x: x[None], observe(one, cameras, [np.zeros((8, 8, 3))], None, SETTINGS).dealt(64))
+    jacobian = jax.eval_shape(jax.jacfwd(lambda v: residuals(problem, v, tiles, jnp.ones(()))), values)
+    assert jacobian.shape == (tiles.weight.size * 3, 3)
 
 
 @pytest.mark.slow

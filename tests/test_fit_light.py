@@ -1,11 +1,15 @@
 """Light, phase functions and surfaces are recovered from pictures, alone and with the transfer function."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import render_quickly
 
 import jvr
+from jvr.model.parameters import is_by_channel
 
 SETTINGS = jvr.Settings(0.8)
 DIRECTION = np.array([0.3, 0.5, -1.0])
@@ -50,6 +54,29 @@ def test_asymmetry_albedo_and_direction(volume):
         assert np.all(error < 0.02)
         assert np.all(np.abs(found - true) < 3 * np.asarray(error) + 1e-5)
     assert np.linalg.norm(result.scene.lights[0].direction) == pytest.approx(1, abs=1e-5)
+
+
+def test_a_channel_of_light_acts_on_its_own_channel_of_a_picture_alone(volume):
+    """As lights declare it, whatever becomes of their light: a fit then moves the three at once."""
+    lights = (
+        jvr.DirectionalLight((0.3, 0.5, -1.0), np.ones(3)),
+        jvr.PointLight((9.0, 4.0, 20.0), np.full(3, 90.0)),
+        jvr.SpotLight((4.0, 4.0, 20.0), (0.0, 0.0, -1.0), np.full(3, 90.0)),
+        jvr.HeadLight(np.ones(3)),
+        jvr.AmbientLight(np.ones(3)),
+    )
+    parts = {"environment": jvr.EnvironmentLight.constant(0.5, order=1), "material": jvr.LambertBRDF((0.3, 0.5, 0.7))}
+    parts |= {"transfer": jvr.LutTransfer(np.full((4, 3), 0.5), np.full(4, 0.2), (0.0, 1.0)), "lights": lights}
+    one = dataclasses.replace(scene(volume), shadows=None, **parts)
+    (camera, *_) = jvr.fibonacci_sphere(one.volume.center, 24.0, 1, 34.0, 8, 8)
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(one) if is_by_channel(one, path)]
+    assert len(paths) == len(lights) + 1
+    before = render_quickly(one, camera, SETTINGS).rgb
+    for path in paths:
+        brighter = lambda p, x, path=path: x.at[..., 1].multiply(1.5) if p == path else x
+        change = render_quickly(jax.tree_util.tree_map_with_path(brighter, one), camera, SETTINGS).rgb - before
+        np.testing.assert_array_equal(change[..., 0::2], 0.0)
+        assert float(jnp.max(change[..., 1])) > 1e-3
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import scipy.optimize
 
 import jvr
 from jvr.fitting.least_squares import AlongDogleg, Damped, Model, Undamped
-from jvr.fitting.objective import Normal
+from jvr.fitting.normal_equations import Normal
 from jvr.fitting.solvers import Functions, Limits
 
 SETTINGS = jvr.Settings(1.0, termination=0.0)

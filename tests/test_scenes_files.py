@@ -570,7 +570,7 @@ def test_what_cannot_be_saved_says_what_to_do(tmp_path):
         TypeError, match=r"^transfer is a test_scenes_files\.OwnTransfer, none of jvr's own classes.*put yours back"
     ):
         jvr.save_scene(scene(transfer=own), path)
-    with pytest.raises(TypeError, match=r"^save_scene needs arrays at hand: call it outside of jax\.jit and jax\.grad"):
+    with pytest.raises(TypeError, match=r"^save_scene needs concrete arrays: call it outside of jax\.jit and jax\.grad"):
         jax.jit(lambda s: jvr.save_scene(s, path))(scene())
     with pytest.raises(TypeError, match="Scene"):
         jvr.save_scene(scene().volume, path)

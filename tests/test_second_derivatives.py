@@ -76,7 +76,7 @@ def test_hessian_vector_products(unknowns, adjoint, depth, x64):
 
 @pytest.mark.parametrize("adjoint", [jvr.Replay(), jvr.Rows()])
 def test_the_gradient_in_colours_along_extinctions_that_are_zero(adjoint, x64):
-    """What a gradient in colours alone leaps over has a derivative in the extinction."""
+    """What a gradient in colours alone skips has a derivative in the extinction."""
     loss, (rgb, sigma_t), (_, along) = make_loss("table", adjoint, depth=False)
     along = jnp.abs(along)
     gradient = lambda sigma_t: jax.grad(lambda rgb: loss((rgb, sigma_t)))(rgb)

@@ -134,6 +134,13 @@ def test_every_public_name_exists():
         assert getattr(jvr, name) is not None
 
 
+def test_a_star_import_brings_every_public_name():
+    """In a process that has loaded none of them yet."""
+    code = "from jvr import *; import jvr; print(sorted({*jvr.__all__} - {*dir()}), len(jvr.__all__) > 100)"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.strip() == "[] True"
+
+
 def test_new_arrays_of_the_same_structure_are_not_traced_again():
     traces = []
 

@@ -202,6 +202,9 @@ class RadianceTransfer(AbstractRadianceTransfer):
 
     def cache_key(self, scene: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
         """Checksums of all that a projection depends on."""
+        return content(self.sources(scene))
+
+    def sources(self, scene: Any) -> Any:
         volume = scene.volume
         parts = [volume.values, volume.gaps, volume.slope, volume.intercept, volume.world_from_grid, volume.interpolation]
         parts += [scene.transfer, scene.clipping, scene.normals if self.needs_gradient or scene.transfer.takes_gradient else None]
@@ -209,7 +212,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
         # Above a surface rays begin in front of it.
         parts.append(np.array([scene.material is not None and scene.material.needs_gradient]))
         is_scattered = self.scattering is not None and (self.projected is None or self.projected.scattered)
-        return content((parts, self.scattering if is_scattered else None))
+        return parts, self.scattering if is_scattered else None
 
     def boundaries(self, shape: tuple[int, int, int]) -> np.ndarray:
         """Ends of the steps of a ray, as fractions of the volume's diameter."""

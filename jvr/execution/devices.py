@@ -104,7 +104,7 @@ def everywhere(tree: Result) -> Result:
 
 
 def spread(array: Array) -> Array:
-    """An array at hand on every device that rays are spread over: cores of a processor share one copy of it, where a program that is
+    """A concrete array on every device that rays are spread over: cores of a processor share one copy of it, where a program that is
     given an array of one device makes one for each core in each call."""
     among = mesh()
     if among is None or isinstance(array, Tracer) or not isinstance(array, jax.Array) or len(array.sharding.device_set) > 1:
@@ -118,7 +118,7 @@ def spread(array: Array) -> Array:
 
 
 def once(function: Callable[..., Result], *arguments: Any) -> Result:
-    """What a function makes of arrays at hand, by one device and then `spread`: where all of them compute the same, each has a copy. Of
+    """What a function makes of concrete arrays, by one device and then `spread`: where all of them compute the same, each has a copy. Of
     traced arrays it is a part of their program."""
     if mesh() is None or is_traced(arguments):
         return function(*arguments)
@@ -132,14 +132,14 @@ def _of_one_device(array: Any) -> Any:
 
 
 def on_devices(rays: Array | np.ndarray) -> Array:
-    """An array at hand with a leading axis of rays, each device with the share that `over_rays` gives it."""
+    """A concrete array with a leading axis of rays, each device with the share that `over_rays` gives it."""
     among = mesh()
     if among is None:
         return jnp.asarray(rays)
     shared = NamedSharding(among, PartitionSpec(AXIS))
     if not among.is_multi_process:
         return jax.device_put(rays, shared)
-    # All processes have the same rays at hand; JAX would send them around to see whether that is so.
+    # All processes hold the same rays; JAX would send them around to see whether that is so.
     held = np.asarray(rays)
     return jax.make_array_from_callback(held.shape, shared, lambda place: held[place])
 
@@ -150,7 +150,7 @@ def is_traced(tree: Any = ()) -> bool:
 
 
 def program(function: Callable[..., Result], static_argnums: int | tuple[int, ...] = ()) -> Callable[..., Result]:
-    """`jax.jit` of a function that is a program of its own where its arguments are at hand, and a part of another one elsewhere.
+    """`jax.jit` of a function that is a program of its own where its arguments are concrete, and a part of another one elsewhere.
 
     On processors it then works with vectors as wide as they have, where the compiler's own choice is half of that.
     """

@@ -87,7 +87,7 @@ def in_tiles(function: Callable[[Int[Array, "blocks"]], Result], blocks: Int[Arr
 
 
 def within_memory(function: Callable[[int], Result], tile: int) -> Result:
-    """`function(tile)` of arrays at hand; where that does not fit into memory, with half the tile, with one warning. Of several processes
+    """`function(tile)` of concrete arrays; where that does not fit into memory, with half the tile, with one warning. Of several processes
     none can go on alone with another program than the others: there what does not fit is an error."""
     warned = False
     while True:

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jvr.atomic import replacing
-from jvr.fitting.objective import Problem
 from jvr.fitting.observations import Observations
+from jvr.fitting.problem import Problem
 
 # Digests by name.
 Fingerprint = dict[str, str]

@@ -13,19 +13,13 @@ from jaxtyping import Array, Float
 from jvr.execution.devices import on_devices
 from jvr.fitting.identifiability import Identifiability, identifiability
 from jvr.fitting.losses import DSSIM, SquaredError
-from jvr.fitting.objective import (
-    Normal,
-    Problem,
-    image_value,
-    light_tangents,
-    normal_equations,
-    prior_expansion,
-    residuals,
-    value,
-)
+from jvr.fitting.normal_equations import Normal, light_tangents, normal_equations, prior_expansion
+from jvr.fitting.objective import image_value, residuals, value
 from jvr.fitting.observations import Observations
+from jvr.fitting.problem import Problem
 from jvr.fitting.solvers import Functions, Limits
 from jvr.model.camera import AbstractCamera
+from jvr.model.ranges import UnitVector
 from jvr.types import Scalar
 
 # The first level of a least-squares solver takes at most every so-manieth ray ...
@@ -129,9 +123,10 @@ class Evaluator:
     def _gauge(self, values: Float[Array, "unknowns"], diagonal: np.ndarray) -> np.ndarray:
         """What fixes the length of directions: it is 1 by convention, and no image says anything about it."""
         fixed, begin = np.zeros((values.size,) * 2), 0
-        for name, part in zip(self.problem.unknowns.names, self.problem.unknowns.split(values, self.problem.model), strict=True):
-            if name.endswith(".direction"):
-                columns = slice(begin, begin + 3)
+        unknowns = self.problem.unknowns
+        for declared, part in zip(unknowns.ranges, unknowns.split(values, self.problem.model), strict=True):
+            if isinstance(declared, UnitVector):
+                columns = slice(begin, begin + part.size)
                 fixed[columns, columns] = diagonal[columns].max() * np.outer(part, part)
             begin += part.size
         return fixed

@@ -18,15 +18,17 @@ from jvr.execution.devices import shares
 from jvr.fitting import checkpoint as checkpoints
 from jvr.fitting.evaluator import Evaluator
 from jvr.fitting.identifiability import Identifiability, undetermined
+from jvr.fitting.kinds import march_unknowns
 from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.minimisers import OptimistixSolver
-from jvr.fitting.objective import Problem, march_unknowns
 from jvr.fitting.observations import Observations, check_images, is_mostly_empty, keep_samples, observe
+from jvr.fitting.problem import Problem
 from jvr.fitting.solvers import AbstractSolver
 from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
+from jvr.model.transfer import AbstractTable
 from jvr.rendering.image import render
 from jvr.rendering.measure import similarity
 from jvr.rendering.medium import needs_gradient
@@ -39,8 +41,6 @@ CHUNK = 16_384
 KEEP_LIMIT = 2**30
 # The Jacobian of other unknowns than a table's entries takes one march for each.
 MOST_FORWARD = 512
-# Parts of a scene that radiance transfer is computed from: what was computed beforehand stays that of the start.
-SHAPE_LIGHT = ("scene.transfer", "scene.volume", "scene.clipping", "scene.material")
 
 
 class Iteration(NamedTuple):
@@ -162,12 +162,7 @@ def fit(
     scene = scene.current()
     model = ExposedModel(scene, jnp.ones(()) if exposure else None)
     chosen = _choose(model, unknowns, transforms, solver)
-    if any(name.startswith("scene.volume") for name in chosen.names):
-        # What the volume keeps would be that of the start.
-        kept = lambda m: (m.scene.volume.bricks, m.scene.volume.gradients)
-        model = eqx.tree_at(kept, model, (None, None), is_leaf=lambda x: x is None)
-    if scene.radiance_transfer is not None and any(name.startswith(SHAPE_LIGHT) for name in chosen.names):
-        model = eqx.tree_at(lambda m: m.scene.radiance_transfer, model, scene.radiance_transfer.pinned())
+    model = _without_stale(model, chosen)
     scene, chosen = model.scene, _choose(model, unknowns, transforms, solver)
     start = chosen.model_from_unconstrained(model, chosen.unconstrained_from_model(model))
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
@@ -213,7 +208,7 @@ def fit(
         scene=found.scene,
         history=tuple(history),
         standard_errors=jax.tree.unflatten(structure, errors[: len(selected)]),
-        unknowns=tuple(name.removeprefix("scene.") for name in chosen.names[: len(selected)]),
+        unknowns=chosen.names[: len(selected)],
         outcome=outcome or Outcome.STEP_LIMIT,
         exposure=1.0 if found.exposure is None else float(found.exposure),
         stats=stats,
@@ -236,6 +231,18 @@ def _choose(model: ExposedModel, unknowns: Callable[[Scene], Any], transforms: A
     if transforms is not None:
         transforms = (*transforms, *([None] if model.exposure is not None else []))
     return choose_unknowns(model, select, transforms, solver.bounds)
+
+
+def _without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
+    """The model without what was computed of the unknowns' start and would stay so: what its volume keeps, and a radiance transfer, which
+    is taken as it is."""
+    transfer = lambda m: m.scene.radiance_transfer
+    if model.scene.radiance_transfer is not None and chosen.among(model, lambda m: transfer(m).sources(m.scene)):
+        model = eqx.tree_at(transfer, model, model.scene.radiance_transfer.pinned())
+    if chosen.among(model, lambda m: m.scene.volume):
+        kept = lambda m: (m.scene.volume.bricks, m.scene.volume.gradients)
+        model = eqx.tree_at(kept, model, (None, None), is_leaf=lambda x: x is None)
+    return model
 
 
 def _check(problem: Problem, solver: AbstractSolver) -> None:
@@ -263,13 +270,15 @@ def _check(problem: Problem, solver: AbstractSolver) -> None:
 
 def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool | int) -> tuple[Problem, Observations]:
     """Samples along the rays, where the volume and its clipping are known and memory allows."""
-    moving = any(name.startswith(("scene.volume", "scene.clipping")) for name in problem.unknowns.names)
+    among = lambda select: problem.unknowns.among(problem.model, select)
+    moving = among(lambda m: (m.scene.volume, m.scene.clipping))
     # What is kept is the scalar alone.
     if keep is False or moving or needs_gradient(problem.model.scene) or isinstance(problem.loss, DSSIM):
         return problem, observations
     limit = KEEP_LIMIT if keep is True else keep
-    ends = ("scene.transfer.positions", "scene.transfer.domain")
-    clamped = not any(name.startswith(ends) for name in problem.unknowns.names)
+    # Colours and extinctions of a table leave its ends where they are; whatever else it has may move them.
+    entries = lambda transfer: (transfer.rgb, transfer.sigma_t) if isinstance(transfer, AbstractTable) else ()
+    clamped = among(lambda m: m.scene.transfer) == among(lambda m: entries(m.scene.transfer))
     kept = keep_samples(problem.model.scene, observations, problem.settings, chunk, limit, clamped=clamped)
     if kept is None:
         return problem, observations
@@ -289,7 +298,7 @@ def _least_determined(
     """The largest coefficients of the least-determined direction, with the names of their unknowns."""
     labels = []
     for name, array in zip(chosen.names, chosen.values(model), strict=True):
-        labels += [f"{name.removeprefix('scene.')}[{', '.join(map(str, i))}]" for i in np.ndindex(array.shape)]
+        labels += [f"{name}[{', '.join(map(str, i))}]" for i in np.ndindex(array.shape)]
     order = np.argsort(-np.abs(known.least_determined))[:most]
     return tuple((labels[i], float(known.least_determined[i])) for i in order)
 

@@ -18,7 +18,7 @@ import optimistix as optx
 import scipy.optimize
 from jaxtyping import Array, Float
 
-from jvr.fitting.objective import Normal
+from jvr.fitting.normal_equations import Normal
 from jvr.fitting.solvers import AbstractSolver, Functions
 from jvr.model.ranges import ANY, Interval
 from jvr.types import Outcome

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.fitting.objective import Normal
+from jvr.fitting.normal_equations import Normal
 from jvr.model.ranges import Interval
 from jvr.types import Outcome
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.fitting.bijectors import AbstractBijector, bijector_of
-from jvr.model.parameters import parameter
-from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range, range_at
+from jvr.model.parameters import is_by_channel, parameter, range_at
+from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range
 from jvr.model.scene import Scene
 from jvr.types import Scalar
 
@@ -24,11 +24,20 @@ class ExposedModel(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """The unknown arrays of a model, by their index in its list of leaves, with a bijector for each."""
+    """The unknown arrays of a model, by their index in its list of leaves: for each the name that users read, what its class declares
+    (`jvr.model.parameters`) and a bijector."""
 
     indices: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
+    ranges: tuple[Range, ...] = eqx.field(static=True)
+    by_channel: tuple[bool, ...] = eqx.field(static=True)
     bijectors: tuple[AbstractBijector, ...]
+
+    def among(self, model: ExposedModel, select: Callable[[ExposedModel], Any]) -> frozenset[int]:
+        """Which of the unknown arrays, counted from 0, are leaves of the parts that `select` picks out of the model; what these parts
+        compute of leaves is none of them."""
+        selected = set(_leaf_indices(model, select))
+        return frozenset(i for i, index in enumerate(self.indices) if index in selected)
 
     def values(self, model: ExposedModel) -> list[Float[Array, "..."]]:
         """The unknown arrays, each with its own shape."""
@@ -80,20 +89,17 @@ def choose_unknowns(
     `select` is called on abstract arrays: it may look at structure and shapes, not at values.
 
     Without `transforms` (a tuple, one for each array, `None` where the default is wanted) each array keeps to the range that its class
-    declares (`jvr.model.ranges`): for a solver that keeps `bounds` as the values themselves, else by a smooth map.
+    declares (`jvr.model.parameters`): for a solver that keeps `bounds` as the values themselves, else by a smooth map.
 
     **Raises** `ValueError` where an array is not one of the scene's, not floating point, named twice or outside of its range, or the
     number of transforms differs.
     """
     indices = _indices(model, select)
     leaves = jax.tree_util.tree_leaves_with_path(model)
-    named = [(_name(path), leaf) for path, leaf in leaves]
-    for name, array in (named[i] for i in indices):
-        if not eqx.is_inexact_array(array):
-            raise ValueError(
-                f"{name.removeprefix('scene.')} has integer voxels, which cannot be fitted: convert them to floating point first"
-            )
-    names = tuple(named[i][0] for i in indices)
+    names = tuple(_name(leaves[i][0]) for i in indices)
+    for name, index in zip(names, indices, strict=True):
+        if not eqx.is_inexact_array(leaves[index][1]):
+            raise ValueError(f"{name} has integer voxels, which cannot be fitted: convert them to floating point first")
     given = (None,) * len(indices) if transforms is None else tuple(transforms)
     if len(given) != len(indices):
         raise ValueError(
@@ -101,13 +107,19 @@ def choose_unknowns(
         )
     voxel = jnp.min(model.scene.volume.spacing)
 
-    def default(path: Any, value: Array) -> AbstractBijector:
-        declared = range_at(model, path)
-        _check_start(_name(path).removeprefix("scene."), value, declared)
-        return bijector_of(declared, value, voxel, bounds)
+    def default(name: str, index: int, declared: Range) -> AbstractBijector:
+        _check_start(name, leaves[index][1], declared)
+        return bijector_of(declared, leaves[index][1], voxel, bounds)
 
-    chosen = tuple(t or default(*leaves[i]) for t, i in zip(given, indices, strict=True))
-    return Unknowns(indices, names, chosen)
+    ranges = tuple(range_at(model, leaves[i][0]) for i in indices)
+    by_channel = tuple(is_by_channel(model, leaves[i][0]) for i in indices)
+    chosen = tuple(t or default(*known) for t, known in zip(given, zip(names, indices, ranges, strict=True), strict=True))
+    return Unknowns(indices, names, ranges, by_channel, chosen)
+
+
+def leaves_by_name(scene: Scene) -> dict[str, Array]:
+    """The arrays of a scene, or of a part of it in its place, by the names that users read, such as `transfer.rgb`."""
+    return {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(scene)}
 
 
 def _check_start(name: str, value: Array, declared: Range) -> None:
@@ -120,8 +132,8 @@ def _check_start(name: str, value: Array, declared: Range) -> None:
         )
 
 
-def _indices(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> tuple[int, ...]:
-    """Where in the model's list of leaves the selected arrays are.
+def _leaf_indices(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> list[int | None]:
+    """Where in the model's list of leaves each selected array is, `None` for one that is no leaf.
 
     In an abstract model every leaf is an object of its own, also where two fields hold one and the same array.
     """
@@ -133,6 +145,12 @@ def _indices(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> tupl
         indices.extend(index.get(id(array)) for array in jax.tree.leaves(select(jax.tree.unflatten(structure, abstract))))
 
     jax.eval_shape(note_indices, *leaves)
+    return indices
+
+
+def _indices(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> tuple[int, ...]:
+    """Where in the model's list of leaves the unknown arrays are."""
+    indices = _leaf_indices(model, select)
     if not indices:
         raise ValueError("unknowns returned no array: name at least one, for example lambda s: s.transfer.rgb")
     found = tuple(index for index in indices if index is not None)
@@ -146,4 +164,4 @@ def _indices(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> tupl
 
 
 def _name(path: Any) -> str:
-    return jax.tree_util.keystr(path).lstrip(".")
+    return jax.tree_util.keystr(path).removeprefix(".scene").lstrip(".")

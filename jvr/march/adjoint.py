@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from jvr.march.march import Marched, MarchOptions, ReplayRecord, integrate, march
 from jvr.march.medium import Medium, for_derivatives
-from jvr.march.rules import is_zero, leaping, wanted_and_fixed, with_zeros
+from jvr.march.rules import is_zero, skipping, wanted_and_fixed, with_zeros
 from jvr.march.segments import ActiveRays, SegmentBatch, active_rays, node_points, occupied_count, resample, with_lighting
 from jvr.march.steps import Rays, Sample, points_at, segment_span
 from jvr.march.sums import opacity, through, transmittance
@@ -59,8 +59,8 @@ def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
     return _replay(None, wanted, fixed, record, with_zeros(cotangent)._replace(steps=None))
 
 
-_integrate = leaping(functools.partial(integrate, for_replay=True), FORWARDS)
-_replay = leaping(lambda _, *arguments: replay(*arguments), FORWARDS)
+_integrate = skipping(functools.partial(integrate, for_replay=True), FORWARDS)
+_replay = skipping(lambda _, *arguments: replay(*arguments), FORWARDS)
 replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
 
 

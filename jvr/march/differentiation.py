@@ -12,7 +12,7 @@ from jvr.march.adjoint import FORWARDS, Inputs, is_there, replay_march
 from jvr.march.jacobian import TableJacobian, table_jacobian
 from jvr.march.march import Marched, MarchOptions, march
 from jvr.march.medium import Medium, taking_all
-from jvr.march.rules import forwards_only, is_zero, leaping
+from jvr.march.rules import forwards_only, is_zero, skipping
 from jvr.march.steps import Rays
 from jvr.model.transfer import AbstractTable, AbstractTransfer
 from jvr.types import Scalar
@@ -90,8 +90,8 @@ def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tup
 
 
 _jacobian_march.defjvp(_jacobian_rule, symbolic_zeros=True)
-_march = leaping(march, FORWARDS)
-_table_jacobian = leaping(lambda options, *inputs: table_jacobian(options[0], *inputs, of_extinctions=options[1]), FORWARDS)
+_march = skipping(march, FORWARDS)
+_table_jacobian = skipping(lambda options, *inputs: table_jacobian(options[0], *inputs, of_extinctions=options[1]), FORWARDS)
 
 
 def _split_entries(tree: AbstractTransfer) -> tuple[Any, Any]:

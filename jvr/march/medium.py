@@ -114,7 +114,7 @@ def taking_all(medium: Medium) -> Medium:
 
 
 def showing_all(media: Any) -> Any:
-    """Media, whole or in parts, in which nothing that may have a derivative is leapt over: as `taking_all`, in the same structure."""
+    """Media, whole or in parts, in which nothing that may have a derivative is skipped: as `taking_all`, in the same structure."""
     is_occupancy = lambda x: isinstance(x, Occupancy)
     shown = lambda x: jax.tree.map(jnp.zeros_like, x) if is_occupancy(x) and not x.is_bounded else x
     return jax.tree.map(shown, media, is_leaf=is_occupancy)

@@ -37,8 +37,8 @@ def wanted_and_fixed(arguments: Any) -> tuple[Any, Any]:
     return eqx.partition(values(arguments), perturbed)
 
 
-def leaping(function: Callable[..., Tree], remedy: str) -> Callable[..., Tree]:
-    """`function(options, *arguments)`, which leaps over empty bricks of the media among its arguments, and not where it is differentiated:
+def skipping(function: Callable[..., Tree], remedy: str) -> Callable[..., Tree]:
+    """`function(options, *arguments)`, which skips empty bricks of the media among its arguments, and not where it is differentiated:
     what is empty adds nothing to a value and may well have a derivative. Those are of forward mode; reverse mode is refused, with the
     `remedy`."""
 

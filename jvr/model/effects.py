@@ -112,6 +112,10 @@ class AbstractRadianceTransfer(eqx.Module):
         """How far above a surface, in the world, it is known what arrives."""
 
     @abc.abstractmethod
+    def sources(self, scene: Any) -> Any:
+        """The parts of a scene that it is computed from."""
+
+    @abc.abstractmethod
     def stale(self, scene: Any) -> tuple[str, ...]:
         """What has to be computed again for a scene of concrete arrays, in a sentence; empty where nothing has."""
 

@@ -29,7 +29,7 @@ class EnvironmentLight(eqx.Module):
     Sums of environments are environments: `probe + EnvironmentLight.disc(...)`.
     """
 
-    coefficients: Float[Array, "bands 3"] = parameter(doc="of the harmonics, red, green, blue")
+    coefficients: Float[Array, "bands 3"] = parameter(by_channel=True, doc="of the harmonics, red, green, blue")
     clamped: bool = choice(doc="whether negative radiance is cut off")
 
     def __init__(self, coefficients: ArrayLike, *, clamped: bool = True):

@@ -23,7 +23,7 @@ from jvr.types import ArrayLike, Scalar, Triple, Vector
 
 def brightness(doc: str) -> Any:
     """The declaration of a light's strength, grey or linear RGB."""
-    return parameter(RADIANCE, shapes=GREY_OR_RGB, doc=doc)
+    return parameter(RADIANCE, shapes=GREY_OR_RGB, by_channel=True, doc=doc)
 
 
 def way() -> Any:

@@ -8,7 +8,7 @@
         def __init__(self, position: ArrayLike, radius: ArrayLike = 1.0, segments: int = 16):
             assign(self, position=position, radius=radius, segments=segments)
 
-From it come the constructor's check (`assign`), what a fit keeps an array to (`jvr.model.ranges.range_at`), the table of the class in a
+From it come the constructor's check (`assign`), what a fit keeps an array to (`range_at`), the table of the class in a
 configuration (`jvr.io.config.schema.parts`), how it is saved and loaded, and the reference (`jvr.io.reference`).
 """
 
@@ -18,6 +18,7 @@ import typing
 from typing import Any, TypeAlias
 
 import equinox as eqx
+import jax
 
 from jvr.model.checks import colours, float_array, known, radiances
 from jvr.model.ranges import ANY, Interval, Range
@@ -44,6 +45,8 @@ class Parameter:
     - `doc`: what it is, in a few words that errors and the reference show; `unit`: of its numbers; `hint`: a value to begin with.
     - `shapes`: of its array; `None`: as the annotation says.
     - `by_scalar`: whether a `jvr.ByValue` may stand in its place.
+    - `by_channel`: whether, where the last axis is colour, each of its channels acts on that channel of a picture alone, as those of light
+      do. A fit then takes one forward derivative for all three.
     - `least`: entries that a named axis has at least.
     """
 
@@ -53,6 +56,7 @@ class Parameter:
     hint: str = ""
     shapes: tuple[Shape, ...] | None = None
     by_scalar: bool = False
+    by_channel: bool = False
     least: int = 1
 
     @property
@@ -68,10 +72,11 @@ def parameter(
     hint: str = "",
     shapes: tuple[Shape, ...] | None = None,
     by_scalar: bool = False,
+    by_channel: bool = False,
     least: int = 1,
 ) -> Any:
     """A field that is an array, or another part of a scene; see `Parameter`."""
-    return eqx.field(metadata={"parameter": Parameter(within, doc, unit, hint, shapes, by_scalar, least)})
+    return eqx.field(metadata={"parameter": Parameter(within, doc, unit, hint, shapes, by_scalar, by_channel, least)})
 
 
 def choice(within: Range = ANY, *, doc: str, unit: str = "", hint: str = "", **default: Any) -> Any:
@@ -83,6 +88,30 @@ def choice(within: Range = ANY, *, doc: str, unit: str = "", hint: str = "", **d
 def declared(cls: type) -> dict[str, dataclasses.Field]:
     """The fields of a class that are declared parameters, by name."""
     return {f.name: f for f in dataclasses.fields(cls) if "parameter" in f.metadata}
+
+
+def range_at(tree: Any, path: tuple[Any, ...]) -> Range:
+    """The range of the leaf of `tree` at a path of `jax.tree_util`: the innermost declared along it that limits anything, such as that of
+    an asymmetry for the values of a `jvr.ByValue` in its place, and any number where none does."""
+    return next((about.within for about in _declared_at(tree, path) if about.within != ANY), ANY)
+
+
+def is_by_channel(tree: Any, path: tuple[Any, ...]) -> bool:
+    """Whether each colour channel of the leaf of `tree` at a path acts on that channel of a picture alone."""
+    return next((about.by_channel for about in _declared_at(tree, path)), False)
+
+
+def _declared_at(tree: Any, path: tuple[Any, ...]) -> list[Parameter]:
+    """What the fields along a path declare, the innermost first."""
+    found: list[Parameter] = []
+    for key in path:
+        if isinstance(key, jax.tree_util.GetAttrKey):
+            field = declared(type(tree)).get(key.name)
+            found = found if field is None else [field.metadata["parameter"], *found]
+            tree = getattr(tree, key.name)
+        else:
+            tree = tree[key.key if isinstance(key, jax.tree_util.DictKey) else key.idx]
+    return found
 
 
 def assign(part: eqx.Module, **values: Any) -> None:

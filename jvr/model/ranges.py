@@ -4,7 +4,6 @@ import dataclasses
 import math
 from typing import Any, TypeAlias
 
-import jax
 import numpy as np
 
 
@@ -142,17 +141,3 @@ TRANSMITTANCE = Interval(0.0, 1.0, "[)")
 # Linear RGB of which 1 is white, and the strength of a light. Constructors take brighter ones than fits make.
 COLOUR = Interval(0.0, 1.0, light="colour")
 RADIANCE = Interval(low=0.0, light="radiance")
-
-
-def range_at(tree: Any, path: tuple[Any, ...]) -> Range:
-    """The range of the leaf of `tree` at a path of `jax.tree_util`: the innermost declared along it that limits anything, such as that of
-    an asymmetry for the values of a `jvr.ByValue` in its place, and any number where none does."""
-    found: Range = ANY
-    for key in path:
-        if isinstance(key, jax.tree_util.GetAttrKey):
-            (field,) = (f for f in dataclasses.fields(tree) if f.name == key.name)
-            within = field.metadata["parameter"].within if "parameter" in field.metadata else ANY
-            found, tree = found if within == ANY else within, getattr(tree, key.name)
-        else:
-            tree = tree[key.key if isinstance(key, jax.tree_util.DictKey) else key.idx]
-    return found

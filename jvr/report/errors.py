@@ -3,8 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
+from jvr.model.parameters import range_at
+from jvr.model.ranges import Interval
 from jvr.model.transfer import AbstractTransfer
 
 
@@ -15,7 +18,8 @@ def field_errors(
 
     **Arguments:** `standard_errors`: a mapping from fields, called `"rgb"` or, as `FitResult.errors_by_name` does,
     `"transfer.rgb"`; or a transfer function that holds errors in place of values. What is not a field of the transfer function is
-    left out. The error of a colour that exceeds 1 becomes infinite: colours end there, so the images have not determined it.
+    left out. An error that exceeds the width of the range that its field declares, as one of a colour above 1, becomes infinite: the
+    images have not determined it.
 
     **Raises** `ValueError` where an error has not the shape of its field.
     """
@@ -29,6 +33,11 @@ def field_errors(
             continue
         if np.shape(error) != np.shape(value):
             raise ValueError(f"the errors of {field} have shape {np.shape(error)}, its values {np.shape(value)}")
-        error = np.asarray(error)
-        found[field] = np.where(error > 1, np.inf, error) if field == "rgb" else error
+        found[field] = np.where(np.asarray(error) > _width(transfer, field), np.inf, error)
     return found
+
+
+def _width(transfer: AbstractTransfer, field: str) -> float:
+    """Of the range that a field declares."""
+    declared = range_at(transfer, (jax.tree_util.GetAttrKey(field),))
+    return declared.high - declared.low if isinstance(declared, Interval) else np.inf

@@ -42,7 +42,7 @@ def save_scene(scene: Scene, path: str | os.PathLike) -> None:
     if type(scene) is not Scene:
         raise TypeError(f"save_scene writes a jvr.Scene, not a {type(scene).__name__}")
     if is_traced(scene):
-        raise TypeError("save_scene needs arrays at hand: call it outside of jax.jit and jax.grad")
+        raise TypeError("save_scene needs concrete arrays: call it outside of jax.jit and jax.grad")
     scene = jax.tree.map(jnp.asarray, scene)
     # What is kept of voxels that have been replaced since is of no use.
     scene = eqx.tree_at(lambda s: s.volume, scene, scene.volume.current())

@@ -1,12 +1,13 @@
 """Tables of the fitted values with their standard errors."""
 
-import re
 from collections.abc import Mapping
 from html import escape
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
+from jvr.fitting.unknowns import leaves_by_name
 from jvr.model.transfer import AbstractTransfer, GaussianTransfer
 from jvr.pictures import srgb_from_linear
 from jvr.report.page.words import COLOURS, TITLES, entries_in_words, with_error
@@ -85,11 +86,12 @@ def _undetermined(transfer: AbstractTransfer, errors: dict[str, np.ndarray]) -> 
 
 def other_values(scene: Any, errors: Mapping[str, np.ndarray]) -> str:
     """What was fitted beside a transfer function of the scalar: small arrays as numbers, others by size alone."""
-    rows = []
+    rest = scene if scene.transfer.takes_gradient else eqx.tree_at(lambda s: s.transfer, scene, None)
+    values, rows = leaves_by_name(rest), []
     for name, error in errors.items():
-        if name.startswith("transfer.") and not scene.transfer.takes_gradient:
+        if name not in values:
             continue
-        value = np.asarray(_at(scene, name))
+        value = np.asarray(values[name])
         if value.size <= 16:
             text = ", ".join(_cell(v, e) for v, e in zip(value.ravel().tolist(), error.ravel().tolist(), strict=True))
         else:
@@ -97,10 +99,3 @@ def other_values(scene: Any, errors: Mapping[str, np.ndarray]) -> str:
             text = f"{value.size:,} values, of which the images do not determine {unknown:,}"
         rows.append(f"<tr><th>{escape(name)}</th><td>{text}</td></tr>")
     return f'<h2>Other fitted values</h2><div class="scroll"><table>{"".join(rows)}</table></div>' if rows else ""
-
-
-def _at(scene: Any, name: str) -> Any:
-    """The part of a scene with a name such as `volume.values` or `lights[0].direction`."""
-    for part in re.findall(r"\w+", name):
-        scene = scene[int(part)] if part.isdigit() else getattr(scene, part)
-    return scene

@@ -81,8 +81,8 @@ def _ends(transfer: AbstractTransfer) -> tuple[float, float]:
     if isinstance(transfer, GaussianTransfer):
         center, width = np.asarray(transfer.center), np.asarray(transfer.width)
         return float(np.min(center - 3.5 * width)), float(np.max(center + 3.5 * width))
-    positions = getattr(transfer, "positions", (0.0, 1.0))
-    return float(positions[0]), float(positions[-1])
+    low, high = transfer.ends if isinstance(transfer, AbstractTable) else (0.0, 1.0)
+    return float(low), float(high)
 
 
 def _curve(transfer: AbstractTransfer, span: tuple[float, float]) -> _Curve:

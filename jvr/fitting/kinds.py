@@ -1,0 +1,108 @@
+"""Kinds of unknowns: how each acts on a picture, and so which way its derivative comes.
+
+That is told by where an array is in the scene and by what its class declares (`jvr.model.ranges`), never by its name: an array of a
+class that nobody has thought of is differentiated in forward mode through the whole march.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jvr.fitting.problem import Problem, read_after_march
+from jvr.fitting.unknowns import ExposedModel
+from jvr.march.differentiation import AbstractAdjoint, Forward, Rows
+from jvr.model.scene import Scene
+from jvr.model.transfer import AbstractTable
+from jvr.rendering.medium import needs_gradient
+
+
+class TableEntries(NamedTuple):
+    """Indices of a table's colours and extinctions in the vector of all unknowns, in the shape of either, `None` where they are known."""
+
+    rgb: np.ndarray | None = None
+    sigma_t: np.ndarray | None = None
+
+
+class Kinds(NamedTuple):
+    """Indices of the unknowns in the vector of all by how they act: as `entries` of a table (rows), after the march (`outer`), or inside
+    it (`inner`). `directions`: indices in `inner` that are moved together, one for each channel of the picture."""
+
+    problem: Problem
+    entries: TableEntries
+    outer: np.ndarray
+    inner: np.ndarray
+    directions: np.ndarray
+
+    @classmethod
+    def of(cls, problem: Problem) -> "Kinds":
+        unknowns, model = problem.unknowns, problem.model
+        after, (rgb, sigma_t) = unknowns.among(model, read_after_march), _in_table(problem)
+        entries = TableEntries()
+        outer, inner, directions = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros((0, 3), int)]
+        begin, taken = 0, 0
+        for i, array in enumerate(unknowns.values(model)):
+            indices = np.arange(begin, begin + array.size)
+            begin += array.size
+            if i in rgb:
+                entries = entries._replace(rgb=indices.reshape(array.shape))
+            elif i in sigma_t:
+                entries = entries._replace(sigma_t=indices.reshape(array.shape))
+            elif i in after:
+                outer.append(indices)
+            else:
+                inner.append(indices)
+                own = taken + np.arange(array.size)
+                taken += array.size
+                # A colour of light is seen in that colour alone: one march for all three.
+                apart = unknowns.by_channel[i] and array.shape[-1:] == (3,)
+                directions.append(own.reshape(-1, 3) if apart else np.repeat(own[:, None], 3, axis=1))
+        return cls(problem, entries, np.concatenate(outer), np.concatenate(inner), np.concatenate(directions))
+
+    def basis(self, dtype: Any) -> Float[Array, "directions inner"]:
+        """`directions` as vectors."""
+        vectors = np.zeros((len(self.directions), self.inner.size))
+        np.put_along_axis(vectors, self.directions, 1.0, axis=1)
+        return jnp.asarray(vectors, dtype)
+
+    def changed(self, part: Array, values: Float[Array, "unknowns"], indices: np.ndarray | None = None) -> ExposedModel:
+        """The model of `values` with `part` at some indices, by default those of `inner`. Arrays that hold none of them do not depend on
+        `part`."""
+        unknowns, model = self.problem.unknowns, self.problem.model
+        where = {int(k): i for i, k in enumerate(self.inner if indices is None else indices)}
+        arrays, begin = [], 0
+        for array in unknowns.split(values, model):
+            first = where.get(begin)
+            begin += array.size
+            arrays.append(array if first is None else part[first : first + array.size].reshape(array.shape))
+        return unknowns.insert(model, arrays)
+
+
+def march_unknowns(problem: Problem) -> int:
+    """How many derivatives are taken by forward mode, at the cost of a march each."""
+    return len(Kinds.of(problem).directions)
+
+
+def adjoint_of(problem: Problem) -> AbstractAdjoint:
+    """How the whole residual vector is differentiated."""
+    # Rows do not know light that changes on its way: that of an environment, through a radiance transfer.
+    around = lambda m: () if m.scene.radiance_transfer is None else (m.scene.environment, m.scene.radiance_transfer)
+    known = has_table_jacobian(problem.model.scene) and not problem.unknowns.among(problem.model, around)
+    return Rows() if known else Forward()
+
+
+def has_table_jacobian(scene: Scene) -> bool:
+    """Whether entries of the transfer function act through what a sample is classified as, and nothing else."""
+    by_gradient = needs_gradient(scene) and scene.normals.follows_transfer(scene.volume)
+    shade = scene.shadows is not None or (scene.radiance_transfer is not None and not scene.radiance_transfer.is_frozen)
+    return isinstance(scene.transfer, AbstractTable) and not shade and not by_gradient
+
+
+def _in_table(problem: Problem) -> tuple[frozenset[int], frozenset[int]]:
+    """Which unknowns are colours and which extinctions of a table, where their derivatives come by rows."""
+    if not has_table_jacobian(problem.model.scene):
+        return frozenset(), frozenset()
+    columns = (lambda m: m.scene.transfer.rgb), (lambda m: m.scene.transfer.sigma_t)
+    rgb, sigma_t = (problem.unknowns.among(problem.model, column) for column in columns)
+    return rgb, sigma_t
