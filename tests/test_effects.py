@@ -104,7 +104,7 @@ def test_lights_that_nothing_shows_are_not_in_the_program():
     assert of_volume(scene(**LIGHT)) == of_volume(scene())
     (lights,) = (part for part in jvr.plan(scene(**LIGHT)).parts if part.name == "lights")
     assert not lights.included
-    assert "nothing reflects or scatters them" in lights.reason
+    assert "nothing reflects or scatters it" in lights.reason
 
 
 def test_new_numbers_compile_nothing():
@@ -180,14 +180,14 @@ def without(one, **parts):
 def test_effects_are_those_that_the_scene_may_do_without():
     """Each leaves a scene that can be rendered, and says how."""
     one, _ = dark_scene()
-    found = {name.split(" ")[0]: change(one, jvr.Settings())[0] for name, change in effects_of(one)}
+    found = {effect.place: effect.change(one, jvr.Settings())[0] for effect in effects_of(one)}
     assert set(found) == {"shadows", "shading", "scattering", "lights[0]", "lights[1]"}
     assert found["shadows"].shadows is None
     assert found["shading"].shading is None
     assert found["scattering"].scattering is None
     assert found["lights[1]"].lights == one.lights[:1]
     only = dataclasses.replace(one, scattering=None)
-    (dropped,) = (change(only, jvr.Settings())[0] for name, change in effects_of(only) if name.startswith("shading"))
+    (dropped,) = (effect.change(only, jvr.Settings())[0] for effect in effects_of(only) if effect.place == "shading")
     assert dropped.shadows is None
 
 

@@ -42,7 +42,7 @@ def picture(scene, settings=SETTINGS):
 def transfer_at(scene):
     """Coefficients at the nodes of a scene, `(nodes, channels, bands)`, and `solid` and `facing` side by side."""
     return compiled(
-        lambda s: project_all(RadianceTransferProjection.of(s, absorbing(s, None, s.radiance_transfer.needs_gradient)))
+        lambda s: project_all(RadianceTransferProjection.of(s, absorbing(s, None, s.radiance_transfer.rays_need_gradient)))
     )(scene)
 
 

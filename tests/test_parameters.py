@@ -139,6 +139,12 @@ def test_a_contributors_classes_are_rendered():
     np.testing.assert_allclose(half - one, (1.5**2 - 1) / 3 * (two - one), rtol=1e-3, atol=1e-6)
 
 
+def test_what_a_contributors_light_has_no_strength_by_is_told_by_its_declaration():
+    dark = jvr.Scene(SCENE.volume, SCENE.transfer, lights=[LampLight((0.0, 0.0, -1.0), 0.0)], scattering=SCENE.scattering)
+    remarks = ["; ".join(scene.lights[0].remarks("light", scene, None)) for scene in (SCENE, dark)]
+    assert remarks == ["", "light LampLight has no strength: it is computed and adds nothing"]
+
+
 def scene_with_gain(gain: Any) -> jvr.Scene:
     light = LampLight((0.0, 0.0, -1.0), gain=gain, power=2)
     return jvr.Scene(SCENE.volume, SCENE.transfer, lights=[light], scattering=SCENE.scattering)
@@ -155,7 +161,7 @@ def test_a_contributors_parameters_are_fitted_in_their_range(bounds):
 
 
 def test_only_families_and_free_names_are_registered():
-    with pytest.raises(TypeError, match=r"Volume is none of AbstractLight, .*, which files can name"):
+    with pytest.raises(TypeError, match=r"Volume is none of AbstractEmitter, .*, which files can name"):
         jvr.register("grid", jvr.Volume)
     with pytest.raises(ValueError, match="'point' or the name LampLight is that of another class"):
         jvr.register("point", LampLight)

@@ -1,7 +1,8 @@
 """Deep shadow maps: transmittance along each of the light's rays as few straight pieces (Lokovic and Veach 2000)."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +16,7 @@ from jvr.march.steps import Point
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
 from jvr.model.parameters import assign, choice
+from jvr.model.parts import Knob, multiples
 from jvr.model.ranges import AT_LEAST_ONE, FRACTION
 from jvr.model.scene import Scene
 from jvr.numerics import read_run, transformed
@@ -56,9 +58,15 @@ class DeepShadowMap(AbstractShadows):
             maps.append(DeepMap(space, z, clear, stats))
         return DeepVisibility(scene.volume.world_from_grid, tuple(maps))
 
-    def coarser(self) -> tuple[AbstractShadows, ...]:
-        fewer = DeepShadowMap(max(self.texels // 2, 2), self.layers, error=self.error)
-        return fewer, DeepShadowMap(self.texels, max(self.layers // 2, 1), error=self.error)
+    def remarks(self, name: str, scene: Scene, stats: Any) -> Iterator[str]:
+        if stats is not None and float(stats.shadows.overflow) > 0:
+            share, error = float(stats.shadows.overflow), float(stats.shadows.error)
+            yield f"{share:.0%} of the rays of a deep shadow map ran out of layers (error {error:.2g}): give it more"
+
+    def knobs(self, scene: Scene) -> tuple[Knob, ...]:
+        return multiples("texels", self.texels, (1 / 2, 1, 2), 3, least=2), multiples(
+            "layers", self.layers, (1 / 2, 1, 2), 3, least=1
+        )
 
 
 class ShadowStats(NamedTuple):

@@ -218,7 +218,7 @@ def environment_lighting_of(scene: Scene) -> EnvironmentLighting:
 
 def albedo_of(scene: Scene) -> EnvironmentLighting | None:
     """A scene's material under light of one from everywhere, where rays of its radiance transfer pick up what it reflects."""
-    if scene.radiance_transfer is None or not scene.radiance_transfer.needs_gradient:
+    if scene.radiance_transfer is None or not scene.radiance_transfer.rays_need_gradient:
         return None
     assert scene.material is not None
     everywhere = jnp.full((1, 3), math.sqrt(4 * math.pi), scene.volume.slope.dtype)

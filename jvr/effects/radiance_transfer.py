@@ -22,6 +22,7 @@ from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
 from jvr.model.harmonics.basis import count
 from jvr.model.kept import content
 from jvr.model.parameters import assign, choice, parameter
+from jvr.model.parts import AbstractPart, Knob, multiples
 from jvr.model.ranges import AT_LEAST_ONE, POSITIVE, TRANSMITTANCE, Interval
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
@@ -141,28 +142,41 @@ class RadianceTransfer(AbstractRadianceTransfer):
 
     @property
     def _stale(self) -> str:
-        what = ("transfer function", "volume", "clipping box", *(["material"] if self.needs_gradient else []), "or dipole")
+        what = ("transfer function", "volume", "clipping box", *(["material"] if self.rays_need_gradient else []), "or dipole")
         return (
             f"the radiance transfer was computed for another {', '.join(what)}: call jvr.precompute(scene) again, or, to see the scene "
             "with that of the other one, replace radiance_transfer by radiance_transfer.pinned()"
         )
 
-    def coarser(self) -> tuple[AbstractRadianceTransfer, ...]:
+    def knobs(self, scene: Any) -> tuple[Knob, ...]:
+        product = (Knob("exact", (False, True), True),) if self.exact else ()
         # Of what has been computed beforehand nothing can be saved but the exact product.
-        if self.exact:
-            return (_changed(self, exact=False),)
+        if self.is_frozen:
+            return product
         return (
-            ()
-            if self.is_frozen
-            else (_changed(self, resolution=self.resolution / 2), _changed(self, rays=max(self.rays // 2, 1)))
+            Knob("order", tuple(dict.fromkeys((max(self.order - 1, 0), self.order))), min(self.order + 2, 10)),
+            multiples("rays", self.rays, (1 / 4, 1 / 2, 1), 4, least=1),
+            multiples("resolution", self.resolution, (1 / 2, 1), 2, most=1.0),
+            *product,
         )
+
+    def turned(self, knob: str, value: Any) -> "RadianceTransfer":
+        same = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "projected"}
+        if self.chromaticity is not None and knob == "order":
+            same["chromaticity"] = min(self.chromaticity, value)
+        changed = RadianceTransfer(**(same | {knob: value}))
+        return changed if self.projected is None else changed.with_projected(self.projected)
+
+    def coarser(self, scene: Any) -> tuple[AbstractPart, ...]:
+        # The exact product first: what it costs hides the rest.
+        return (self.turned("exact", False),) if self.exact else super().coarser(scene)
 
     def with_projected(self, projected: ProjectedRadianceTransfer) -> "RadianceTransfer":
         """The same, computed beforehand."""
         return eqx.tree_at(lambda t: t.projected, self, projected, is_leaf=lambda x: x is None)
 
     @property
-    def needs_gradient(self) -> bool:
+    def rays_need_gradient(self) -> bool:
         return isinstance(self.bleeding, MaterialBleeding)
 
     @property
@@ -207,8 +221,12 @@ class RadianceTransfer(AbstractRadianceTransfer):
     def sources(self, scene: Any) -> Any:
         volume = scene.volume
         parts = [volume.values, volume.gaps, volume.slope, volume.intercept, volume.world_from_grid, volume.interpolation]
-        parts += [scene.transfer, scene.clipping, scene.normals if self.needs_gradient or scene.transfer.takes_gradient else None]
-        parts.append(scene.material if self.needs_gradient else None)
+        parts += [
+            scene.transfer,
+            scene.clipping,
+            scene.normals if self.rays_need_gradient or scene.transfer.takes_gradient else None,
+        ]
+        parts.append(scene.material if self.rays_need_gradient else None)
         # Above a surface rays begin in front of it.
         parts.append(np.array([scene.material is not None and scene.material.needs_gradient]))
         is_scattered = self.scattering is not None and (self.projected is None or self.projected.scattered)
@@ -221,10 +239,3 @@ class RadianceTransfer(AbstractRadianceTransfer):
         while ends[-1] < across:
             ends.append(ends[-1] + self.step * self.growth ** (len(ends) - 1))
         return np.minimum(np.array(ends), across) / across
-
-
-def _changed(transfer: RadianceTransfer, **settings: Any) -> RadianceTransfer:
-    """The same with other settings."""
-    same = {f.name: getattr(transfer, f.name) for f in dataclasses.fields(transfer) if f.name != "projected"}
-    changed = RadianceTransfer(**(same | settings))
-    return changed if transfer.projected is None else changed.with_projected(transfer.projected)

@@ -1,12 +1,14 @@
 """Single scattering: light that the medium scatters once on its way to the eye (course notes on GPU-based volume ray-casting,
 Eurographics 2009, chapters 7.1 to 7.4)."""
 
+from collections.abc import Iterator
 from typing import Any
 
 from jvr.effects.shading import surface_weight
 from jvr.model.by_value import ByValue
 from jvr.model.effects import AbstractScattering
 from jvr.model.parameters import GREY_OR_RGB, assign, parameter
+from jvr.model.parts import is_zero
 from jvr.model.phase import AbstractPhase, Isotropic, ScatteringAngle
 from jvr.model.ranges import POSITIVE, UNIT_INTERVAL
 from jvr.types import ArrayLike, Channels, Scalar, Triple
@@ -38,6 +40,10 @@ class SingleScattering(AbstractScattering):
         threshold: ArrayLike | None = None,
     ):
         assign(self, phase=phase, albedo=albedo, threshold=threshold)
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        if is_zero(self.albedo):
+            yield "scattering.albedo is zero everywhere: nothing is scattered"
 
     @property
     def needs_gradient(self) -> bool:

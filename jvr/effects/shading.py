@@ -5,6 +5,7 @@ The normal points from larger to smaller values. Visualization convention: a lig
 colour of the transfer function; the cosine is that of the angle between normal and light.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ from jaxtyping import Array, Float
 from jvr.model.by_value import ByValue
 from jvr.model.effects import AbstractShading
 from jvr.model.parameters import assign, choice, parameter
+from jvr.model.parts import is_zero
 from jvr.model.ranges import AT_LEAST_ONE, NOT_NEGATIVE
 from jvr.numerics import direction_and_length, divide_or_zero, dot, larger, power_of_cosine, smaller
 from jvr.types import ArrayLike, Scalar, Triple
@@ -52,6 +54,10 @@ class Lambert(AbstractShading):
         two_sided: bool = True,
     ):
         assign(self, ambient=ambient, diffuse=diffuse, threshold=threshold, two_sided=two_sided)
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        if is_zero(self.diffuse) and is_zero(getattr(self, "specular", 0.0)):
+            yield "shading.diffuse and shading.specular are zero: nothing but ambient light is reflected"
 
     def ambient_reflectance(self) -> Scalar:
         return self.ambient

@@ -12,6 +12,7 @@ from jvr.march.steps import Point
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
 from jvr.model.parameters import assign, choice
+from jvr.model.parts import Knob, multiples
 from jvr.model.ranges import FRACTION, NOT_NEGATIVE
 from jvr.model.scene import Scene
 from jvr.numerics import read_at, transformed
@@ -60,9 +61,8 @@ class ShadowMap(AbstractShadows):
         _, _, length = space.ray(jnp.zeros_like(spacing), jnp.zeros_like(spacing))
         return DepthMap(space, w + self.bias * spacing / length)
 
-    def coarser(self) -> tuple[AbstractShadows, ...]:
-        chosen = {"threshold": self.threshold, "bias": self.bias}
-        return (ShadowMap(max(self.texels // 2, 2), softness=self.softness, **chosen),)
+    def knobs(self, scene: Scene) -> tuple[Knob, ...]:
+        return (multiples("texels", self.texels, (1 / 4, 1 / 2, 1, 2), 4, least=2),)
 
 
 class DepthMap(eqx.Module):

@@ -15,6 +15,7 @@ from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
 from jvr.model.parameters import assign, choice
+from jvr.model.parts import AbstractPart, Knob, multiples
 from jvr.model.ranges import POSITIVE, TRANSMITTANCE
 from jvr.model.scene import Scene
 from jvr.numerics import ray_box, smaller
@@ -43,7 +44,10 @@ class ShadowRays(AbstractShadows):
     def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         return RayVisibility(scene.clipping, lights, medium, self.step * spacing, MarchOptions(self.termination, distance=False))
 
-    def coarser(self) -> tuple[AbstractShadows, ...]:
+    def knobs(self, scene: Scene) -> tuple[Knob, ...]:
+        return (multiples("step", self.step, (4, 2, 1, 1 / 2), 1 / 4),)
+
+    def coarser(self, scene: Scene) -> tuple[AbstractPart, ...]:
         return ShadowRays(2 * self.step, termination=self.termination), ShadowVolume(1.0), ShadowVolume()
 
 

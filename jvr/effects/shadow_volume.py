@@ -14,6 +14,7 @@ from jvr.march.steps import Point
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
 from jvr.model.parameters import assign, choice
+from jvr.model.parts import Knob, multiples
 from jvr.model.ranges import AT_LEAST_ONE, Interval
 from jvr.model.scene import Scene
 from jvr.numerics import transformed
@@ -46,8 +47,8 @@ class ShadowVolume(AbstractShadows):
         nodes = max(2, math.ceil(self.resolution * diagonal))
         return depth_visibility(scene, lights, medium, nodes + 1, nodes, math.ceil(0.5 / self.resolution))
 
-    def coarser(self) -> tuple[AbstractShadows, ...]:
-        return (ShadowVolume(self.resolution / 2),)
+    def knobs(self, scene: Scene) -> tuple[Knob, ...]:
+        return (multiples("resolution", self.resolution, (1 / 4, 1 / 2, 1, 2), 4, most=4.0),)
 
 
 class OpacityShadowMap(AbstractShadows):
@@ -69,8 +70,10 @@ class OpacityShadowMap(AbstractShadows):
     def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         return depth_visibility(scene, lights, medium, self.texels, self.layers, samples_a_layer(scene, self.layers))
 
-    def coarser(self) -> tuple[AbstractShadows, ...]:
-        return OpacityShadowMap(max(self.texels // 2, 2), self.layers), OpacityShadowMap(self.texels, max(self.layers // 2, 1))
+    def knobs(self, scene: Scene) -> tuple[Knob, ...]:
+        return multiples("texels", self.texels, (1 / 2, 1, 2), 3, least=2), multiples(
+            "layers", self.layers, (1 / 2, 1, 2), 3, least=1
+        )
 
 
 class ClearGrid(eqx.Module):

@@ -31,7 +31,6 @@ from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
 from jvr.rendering.image import render
 from jvr.rendering.measure import similarity
-from jvr.rendering.medium import needs_gradient
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
 
@@ -273,7 +272,7 @@ def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool |
     among = lambda select: problem.unknowns.among(problem.model, select)
     moving = among(lambda m: (m.scene.volume, m.scene.clipping))
     # What is kept is the scalar alone.
-    if keep is False or moving or needs_gradient(problem.model.scene) or isinstance(problem.loss, DSSIM):
+    if keep is False or moving or problem.model.scene.needs_gradient or isinstance(problem.loss, DSSIM):
         return problem, observations
     limit = KEEP_LIMIT if keep is True else keep
     # Colours and extinctions of a table leave its ends where they are; whatever else it has may move them.

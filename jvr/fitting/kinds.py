@@ -15,7 +15,6 @@ from jvr.fitting.unknowns import ExposedModel
 from jvr.march.differentiation import AbstractAdjoint, Forward, Rows
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
-from jvr.rendering.medium import needs_gradient
 
 
 class TableEntries(NamedTuple):
@@ -94,7 +93,7 @@ def adjoint_of(problem: Problem) -> AbstractAdjoint:
 
 def has_table_jacobian(scene: Scene) -> bool:
     """Whether entries of the transfer function act through what a sample is classified as, and nothing else."""
-    by_gradient = needs_gradient(scene) and scene.normals.follows_transfer(scene.volume)
+    by_gradient = scene.needs_gradient and scene.normals.follows_transfer(scene.volume)
     shade = scene.shadows is not None or (scene.radiance_transfer is not None and not scene.radiance_transfer.is_frozen)
     return isinstance(scene.transfer, AbstractTable) and not shade and not by_gradient
 

@@ -12,7 +12,7 @@ from jvr.model.effects import (
     AbstractShading,
     AbstractShadows,
 )
-from jvr.model.light import AbstractLight
+from jvr.model.light import AbstractEmitter
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
 from jvr.model.phase import AbstractPhase
@@ -30,7 +30,7 @@ PARTS: dict[str, str | type] = {
 # What configurations call the classes of a family whose tables are the arguments of their constructors. Kinds whose tables say something
 # else, such as a file, are in `jvr.io.config.schema`.
 KINDS: dict[type, dict[str, str]] = {
-    AbstractLight: {
+    AbstractEmitter: {
         "directional": "DirectionalLight",
         "point": "PointLight",
         "spot": "SpotLight",

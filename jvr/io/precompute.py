@@ -150,7 +150,7 @@ def _projection(scene: Scene) -> RadianceTransferProjection:
     radiance_transfer = radiance_transfer_of(scene)
     where = occupancy(scene, Settings())
     return RadianceTransferProjection.of(
-        scene, absorbing(scene, where, scene.transfer.takes_gradient or radiance_transfer.needs_gradient)
+        scene, absorbing(scene, where, scene.transfer.takes_gradient or radiance_transfer.rays_need_gradient)
     )
 
 

@@ -14,12 +14,16 @@ from jvr.march.march import Marched, MarchOptions, march
 from jvr.march.medium import Medium, taking_all
 from jvr.march.rules import forwards_only, is_zero, skipping
 from jvr.march.steps import Rays
+from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.transfer import AbstractTable, AbstractTransfer
 from jvr.types import Scalar
 
 
-class AbstractAdjoint(eqx.Module):
+class AbstractAdjoint(AbstractPart):
     """An adjoint: a way to differentiate a march."""
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        return (PlanEntry("derivatives", True, f"{type(self).__name__}, if any are asked for"),)
 
     @abc.abstractmethod
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:

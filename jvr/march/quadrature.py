@@ -1,17 +1,31 @@
 """How a segment is integrated: the choices that `Settings(quadrature=...)` takes."""
 
 import abc
+from typing import Any, ClassVar
 
 import equinox as eqx
 
+from jvr.model.parts import AbstractPart, PlanEntry
+from jvr.model.transfer import AbstractTransfer, LinearTransfer, LutTransfer
 
-class AbstractQuadrature(eqx.Module):
+
+class AbstractQuadrature(AbstractPart):
     """A rule for one segment. Static, without arrays."""
+
+    # Whether the transfer function is integrated over the scalars between the ends of a segment.
+    pre_integrates: ClassVar[bool] = False
 
     @property
     @abc.abstractmethod
     def explanation(self) -> str:
         """What the rule does, for `jvr.plan`."""
+
+    @abc.abstractmethod
+    def integrates(self, transfer: AbstractTransfer) -> bool:
+        """Whether it can be used with a transfer function."""
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        return (PlanEntry("pre-integration", self.pre_integrates, self.explanation),)
 
 
 class Midpoint(AbstractQuadrature):
@@ -22,6 +36,9 @@ class Midpoint(AbstractQuadrature):
     def explanation(self) -> str:
         return "a segment has the colour and extinction of its midpoint"
 
+    def integrates(self, transfer: AbstractTransfer) -> bool:
+        return True
+
 
 class PreIntegrated(AbstractQuadrature):
     """Pre-integration: the scalar goes linearly from the front of a segment to its back, and extinction and emission are integrated over
@@ -30,6 +47,8 @@ class PreIntegrated(AbstractQuadrature):
     **Arguments:** `parts`: how many parts of a segment its self-attenuation takes apart, order 4. Needs a `LinearTransfer` or a
     `LutTransfer`. **Raises** `ValueError` where `parts` is not a positive integer.
     """
+
+    pre_integrates: ClassVar[bool] = True
 
     parts: int = eqx.field(static=True, default=1)
 
@@ -40,3 +59,6 @@ class PreIntegrated(AbstractQuadrature):
     @property
     def explanation(self) -> str:
         return f"segments are integrated between the scalars at their ends, self-attenuation in {self.parts} parts"
+
+    def integrates(self, transfer: AbstractTransfer) -> bool:
+        return isinstance(transfer, LinearTransfer | LutTransfer)

@@ -1,16 +1,18 @@
 """The part of the world that is rendered."""
 
-import equinox as eqx
+from typing import Any
+
 import jax.numpy as jnp
 
 from jvr.model.checks import require
 from jvr.model.exact import Exact, Remainder
 from jvr.model.parameters import assign, parameter
+from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.ranges import UNLIMITED
 from jvr.types import ArrayLike, Vector
 
 
-class ClippingBox(eqx.Module):
+class ClippingBox(AbstractPart):
     """An axis-aligned box in world coordinates; what lies outside of it is not rendered.
 
     **Arguments:** `lower`, `upper`: `(3,)`, differentiable (moving a face changes where rays enter and leave); `remainders`: of corners
@@ -27,6 +29,9 @@ class ClippingBox(eqx.Module):
         given = remainders or (None, None)
         self.remainders = (Remainder.left(lower, self.lower, given[0]), Remainder.left(upper, self.upper, given[1]))
         require(self.upper - self.lower, lambda d: d > 0, "ClippingBox needs lower < upper on every axis")
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        return (PlanEntry(name, True, "rays are cut"),)
 
     def moved(self, origin: Exact) -> "ClippingBox":
         """The same box in a world whose origin is at `origin`."""

@@ -1,17 +1,32 @@
 """Interfaces of the effects, so that a scene can hold them and no module of theirs is imported where it does not."""
 
 import abc
-import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
 
 from jvr.model.light import AbstractLight
+from jvr.model.parts import AbstractPart, PlanEntry, spelling
 from jvr.types import Channels, Scalar, Triple
 
 
-class AbstractShading(eqx.Module):
+class AbstractShading(AbstractPart):
     """Local shading: how a surface reflects light."""
+
+    @property
+    def needs_gradient(self) -> bool:
+        return True
+
+    @property
+    def shows_lights(self) -> bool:
+        return True
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        return (PlanEntry(name, True, spelling(self), ("lights", "gradient")),)
+
+    def without(self, scene: Any) -> Any:
+        return scene.replaced(shading=None)
 
     @abc.abstractmethod
     def ambient_reflectance(self) -> Scalar:
@@ -27,13 +42,24 @@ class AbstractShading(eqx.Module):
         in the colour of the light (`None` for nothing)."""
 
 
-class AbstractScattering(eqx.Module):
+class AbstractScattering(AbstractPart):
     """Single scattering: how the medium scatters light."""
 
     @property
     @abc.abstractmethod
     def needs_gradient(self) -> bool:
         """Whether `medium_weight` asks for the length of the gradient."""
+
+    @property
+    def shows_lights(self) -> bool:
+        return True
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        needs = ("lights", "gradient") if self.needs_gradient else ("lights",)
+        return (PlanEntry(name, True, spelling(self), needs),)
+
+    def without(self, scene: Any) -> Any:
+        return scene.replaced(scattering=None)
 
     @abc.abstractmethod
     def medium_weight(self, magnitude: Scalar) -> Scalar:
@@ -48,21 +74,32 @@ class AbstractScattering(eqx.Module):
         """The same per unit of a radiance that comes from everywhere."""
 
 
-class AbstractShadows(eqx.Module):
+class AbstractShadows(AbstractPart):
     """A shadow algorithm: a way to find the transmittance between lights and points."""
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        casting = sum(isinstance(light, AbstractLight) and light.casts_shadows for light in scene.lights)
+        return (PlanEntry(name, True, f"{spelling(self)} for {casting} light{'s' * (casting != 1)}", ("light march",)),)
+
+    def without(self, scene: Any) -> Any:
+        return scene.replaced(shadows=None)
 
     @abc.abstractmethod
     def visibility(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
         """A `jvr.march.medium.AbstractVisibility` of these lights, made once for a picture; differentiable. `medium`: what light passes
         through, a `jvr.march.medium.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""
 
-    def coarser(self) -> tuple["AbstractShadows", ...]:
-        """Cheaper ways to about the same shadows, one notch coarser."""
-        return ()
 
-
-class AbstractMaterial(eqx.Module):
+class AbstractMaterial(AbstractPart):
     """A material: how a point sends light from all directions to the eye."""
+
+    @property
+    def shows_environment(self) -> bool:
+        return True
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        needs = ("environment", "gradient") if self.needs_gradient else ("environment",)
+        return (PlanEntry(name, True, spelling(self), needs),)
 
     @property
     @abc.abstractmethod
@@ -78,7 +115,7 @@ class AbstractBleeding(eqx.Module):
     """Colour bleeding: what rays of a radiance transfer pick up on their way."""
 
 
-class AbstractRadianceTransfer(eqx.Module):
+class AbstractRadianceTransfer(AbstractPart):
     """Radiance transfer: how the medium around a point changes the light of the environment that reaches it."""
 
     # Whether samples bring the light that reaches them, and not a fraction of all of it.
@@ -88,10 +125,20 @@ class AbstractRadianceTransfer(eqx.Module):
     # Highest order of its harmonics.
     order: eqx.AbstractVar[int]
 
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        made = "computed beforehand" if self.is_frozen else "computed in each picture: jvr.precompute"
+        return (PlanEntry(name, True, f"{spelling(self)}, {made}", ("environment", "light march")),)
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        yield from self.stale(scene)
+
+    def without(self, scene: Any) -> Any:
+        return scene.replaced(radiance_transfer=None)
+
     @property
     @abc.abstractmethod
-    def needs_gradient(self) -> bool:
-        """Whether rays ask for gradients of what they pass."""
+    def rays_need_gradient(self) -> bool:
+        """Whether its own rays ask for gradients of what they pass."""
 
     @property
     @abc.abstractmethod
@@ -127,17 +174,3 @@ class AbstractRadianceTransfer(eqx.Module):
     @abc.abstractmethod
     def pinned(self) -> "AbstractRadianceTransfer":
         """The same, to be taken as it is whatever becomes of the scene that it was computed for."""
-
-    def coarser(self) -> tuple["AbstractRadianceTransfer", ...]:
-        """Cheaper ways to about the same light, one notch coarser."""
-        return ()
-
-
-def spelling(part: Any) -> str:
-    """A part of a scene with its static choices, such as `ShadowRays(step=1, termination=0.001)`; nothing for `None`."""
-    if part is None:
-        return ""
-    fields = [f.name for f in dataclasses.fields(part) if f.metadata.get("static")]
-    chosen = ", ".join(f"{name}={getattr(part, name):g}" for name in fields if isinstance(getattr(part, name), int | float))
-    inner = "".join(f", {type(x).__name__}" for x in vars(part).values() if isinstance(x, eqx.Module))
-    return f"{type(part).__name__}({(chosen + inner).removeprefix(', ')})"

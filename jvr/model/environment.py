@@ -2,9 +2,9 @@
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,13 +13,14 @@ from jvr.model import harmonics
 from jvr.model.checks import float_array, known, radiances, require
 from jvr.model.harmonics.projection import cap
 from jvr.model.parameters import assign, choice, parameter
+from jvr.model.parts import AbstractPart, PlanEntry, is_zero, spelling
 from jvr.model.ranges import NOT_NEGATIVE
 from jvr.numerics import normalise
 from jvr.pictures import as_radiance
 from jvr.types import ArrayLike
 
 
-class EnvironmentLight(eqx.Module):
+class EnvironmentLight(AbstractPart):
     """An environment light: radiance that arrives from direction `d` (pointing away from the scene): `L_i(d) = sum_j c_j Y_j(d)`, the
     same at every point.
 
@@ -35,6 +36,19 @@ class EnvironmentLight(eqx.Module):
     def __init__(self, coefficients: ArrayLike, *, clamped: bool = True):
         assign(self, coefficients=coefficients, clamped=clamped)
         harmonics.order_of(self.coefficients)
+
+    def title(self, name: str, scene: Any) -> str:
+        return f"environment and material {spelling(scene.material)}"
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        return (PlanEntry(name, True, f"environment lighting, {len(self.coefficients)} coefficients"),)
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        if is_zero(self.coefficients):
+            yield "environment has no strength: it is computed and adds nothing"
+
+    def without(self, scene: Any) -> Any:
+        return scene.replaced(environment=None)
 
     @classmethod
     def from_image(

@@ -1,6 +1,7 @@
 """Transfer functions of the scalar and of the length of its gradient (Kniss, Kindlmann and Hansen 2002; Levoy 1988)."""
 
-from typing import ClassVar
+import dataclasses
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -70,6 +71,12 @@ class GradientOpacity(AbstractTransfer):
             raise TypeError(f"GradientOpacity scales a transfer function of the scalar, not a {type(transfer).__name__}")
         assign(self, transfer=transfer, low=low, high=high)
         require(self.high - self.low, lambda width: width > 0, "GradientOpacity needs 0 <= low < high")
+
+    def title(self, name: str, scene: Any) -> str:
+        return "gradient opacity"
+
+    def without(self, scene: Any) -> Any:
+        return dataclasses.replace(scene, transfer=self.transfer)
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         assert magnitude is not None

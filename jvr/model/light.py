@@ -5,6 +5,7 @@ single number is grey. Everything is differentiable.
 """
 
 import abc
+from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -15,7 +16,8 @@ from jaxtyping import Array, Float
 
 from jvr.model.checks import float_array, radiances, require
 from jvr.model.exact import Exact, Remainder, in_double
-from jvr.model.parameters import GREY_OR_RGB, assign, parameter
+from jvr.model.parameters import GREY_OR_RGB, assign, declared, parameter
+from jvr.model.parts import AbstractPart, PlanEntry, is_zero
 from jvr.model.ranges import DEGREES, DIRECTION, NOT_NEGATIVE, POSITIVE, RADIANCE, Entries
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import ArrayLike, Scalar, Triple, Vector
@@ -45,7 +47,29 @@ class LightSample(NamedTuple):
     irradiance: Triple
 
 
-class AbstractLight(eqx.Module):
+class AbstractEmitter(AbstractPart):
+    """Whatever a scene may have among its lights."""
+
+    def title(self, name: str, scene: Any) -> str:
+        return f"{name} {type(self).__name__}"
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        shown = scene.shows_lights
+        return (PlanEntry(name, shown, type(self).__name__ + ("" if shown else ": nothing reflects or scatters it")),)
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        fields = [name for name, f in declared(type(self)).items() if f.metadata["parameter"].within == RADIANCE]
+        if fields and all(is_zero(getattr(self, name)) for name in fields):
+            yield f"{self.title(name, scene)} has no strength: it is computed and adds nothing"
+        elif not scene.shows_lights:
+            yield f"{self.title(name, scene)} is not seen: nothing reflects or scatters it"
+
+    def without(self, scene: Any) -> Any:
+        shown = scene.shows_lights and len(scene.lights) > 1
+        return scene.replaced(lights=tuple(light for light in scene.lights if light is not self)) if shown else None
+
+
+class AbstractLight(AbstractEmitter):
     """A light that comes from one direction at each point."""
 
     # Whether what is between the light and a point can shade it.
@@ -183,7 +207,7 @@ class HeadLight(AbstractLight):
         return self
 
 
-class AmbientLight(eqx.Module):
+class AmbientLight(AbstractEmitter):
     """Ambient light: the same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
 
     casts_shadows: ClassVar[bool] = False
@@ -192,6 +216,12 @@ class AmbientLight(eqx.Module):
 
     def __init__(self, radiance: ArrayLike = 1.0):
         assign(self, radiance=radiance)
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        yield from super().remarks(name, scene, stats)
+        reflects = scene.shading is not None and not is_zero(scene.shading.ambient_reflectance())
+        if scene.shows_lights and scene.scattering is None and not reflects:
+            yield f"{self.title(name, scene)} is not seen: shading.ambient is zero"
 
     @property
     def rgb(self) -> Triple:

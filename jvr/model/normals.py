@@ -9,12 +9,12 @@ import abc
 import itertools
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jvr.model.parameters import choice
+from jvr.model.parts import AbstractPart, Knob, PlanEntry, parts_of, spelling
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Nearest, Trilinear, Volume, gradients_at_voxels
 from jvr.numerics import add_runs, divide_or_zero, read_run
@@ -25,11 +25,31 @@ from jvr.types import Channels, Scalar, Triple
 Resampled = tuple[Float[Array, "..."], Triple, Channels]
 
 
-class AbstractNormals(eqx.Module):
+class AbstractNormals(AbstractPart):
     """A gradient estimator. With `of_opacity` it is that of the extinction, after the transfer function (mean of its channels),
     else that of the scalar."""
 
     of_opacity: bool = choice(doc="whether of the extinction, not of the scalar", default=False)
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        asking = " and ".join(other for other, part in parts_of(scene) if part.needs_gradient)
+        reason = f"{spelling(self)}, asked for by {asking}" if asking else "nothing asks for a gradient"
+        return (PlanEntry("gradient", bool(asking), reason),)
+
+    def knobs(self, scene: Any) -> tuple[Knob, ...]:
+        cheaper = {SobelDifferences: (AnalyticGradient, CentralDifferences), AnalyticGradient: ()}.get(
+            type(self), (AnalyticGradient,)
+        )
+        # What a surface looks like is the choice of the scene: the estimator that it names is the finest.
+        values = (*(kind(self.of_opacity) for kind in cheaper), self)
+        return (Knob("estimator", values, self),) if scene.needs_gradient and cheaper else ()
+
+    def turned(self, knob: str, value: Any) -> "AbstractNormals":
+        return value
+
+    def coarser(self, scene: Any) -> tuple[AbstractPart, ...]:
+        cheaper = AnalyticGradient(self.of_opacity)
+        return () if type(self) is AnalyticGradient else (cheaper,)
 
     @abc.abstractmethod
     def resample(self, volume: Volume, p: Triple) -> Resampled:

@@ -2,16 +2,22 @@
 ray-casting, Eurographics 2009, section 1.2.1)."""
 
 import abc
+from typing import Any, ClassVar
 
-import equinox as eqx
-
+from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.transfer import Classified
 from jvr.numerics import one_minus_exp
 from jvr.types import Channels, Scalar
 
 
-class AbstractOpticalModel(eqx.Module):
+class AbstractOpticalModel(AbstractPart):
     """An optical model: how emission and extinction along a segment of length `dt` become radiance and optical depth."""
+
+    # Whether anything is held back, so that a ray may end early.
+    absorbs: ClassVar[bool] = True
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        return (PlanEntry("optical model", True, type(self).__name__),)
 
     @abc.abstractmethod
     def evaluate_segment(self, classified: Classified, dt: Scalar) -> tuple[Channels, Channels]:
@@ -34,6 +40,8 @@ class EmissionAbsorption(AbstractOpticalModel):
 
 class EmissionOnly(AbstractOpticalModel):
     """A glowing, transparent medium: `j = sigma_t * rgb`, `T = 1`."""
+
+    absorbs: ClassVar[bool] = False
 
     def evaluate_segment(self, classified: Classified, dt: Scalar) -> tuple[Channels, Channels]:
         sigma_t = classified.sigma_t * (3 // len(classified.sigma_t))

@@ -1,23 +1,26 @@
 """The scene: a volume and everything that says how it looks."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import equinox as eqx
 
 from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer, AbstractScattering, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
-from jvr.model.light import AbstractLight, AmbientLight
+from jvr.model.light import AbstractEmitter, AbstractLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
 from jvr.model.parameters import assign, parameter
+from jvr.model.parts import AbstractPart, PlanEntry, parts_of
 from jvr.model.ranges import COLOUR
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
 from jvr.types import ArrayLike, Vector
 
 
-class Scene(eqx.Module):
+class Scene(AbstractPart):
     """A volume with transfer function, optical model and lighting. A part that is `None` leaves no trace in the compiled program.
 
     **Arguments:**
@@ -48,7 +51,7 @@ class Scene(eqx.Module):
     background: Vector | None = parameter(COLOUR, doc="red, green, blue, linear")
     optical: AbstractOpticalModel = parameter(doc="one of jvr's")
     clipping: ClippingBox | None = parameter(doc="a jvr.ClippingBox")
-    lights: tuple[AbstractLight | AmbientLight, ...] = parameter(doc="a sequence of jvr's lights")
+    lights: tuple[AbstractEmitter, ...] = parameter(doc="a sequence of jvr's lights")
     shading: AbstractShading | None = parameter(doc="one of jvr's")
     shadows: AbstractShadows | None = parameter(doc="one of jvr's")
     scattering: AbstractScattering | None = parameter(doc="one of jvr's")
@@ -65,7 +68,7 @@ class Scene(eqx.Module):
         background: ArrayLike | None = None,
         optical: AbstractOpticalModel = EmissionAbsorption(),
         clipping: ClippingBox | None = None,
-        lights: Sequence[AbstractLight | AmbientLight] = (),
+        lights: Sequence[AbstractEmitter] = (),
         shading: AbstractShading | None = None,
         shadows: AbstractShadows | None = None,
         scattering: AbstractScattering | None = None,
@@ -88,6 +91,36 @@ class Scene(eqx.Module):
         if self.radiance_transfer is None:
             return scene
         return eqx.tree_at(lambda s: s.radiance_transfer, scene, self.radiance_transfer.checked(self))
+
+    @property
+    def shows_lights(self) -> bool:
+        return any(part.shows_lights for _, part in parts_of(self))
+
+    @property
+    def shows_light(self) -> bool:
+        """Whether anything in it shows light, of lights or of the environment."""
+        return self.shows_lights or any(part.shows_environment for _, part in parts_of(self))
+
+    @property
+    def needs_gradient(self) -> bool:
+        return any(part.needs_gradient for _, part in parts_of(self))
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        return () if self.background is None else (PlanEntry("background", True, "shows through"),)
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        if not self.lights and self.shows_lights:
+            yield "there is no light: shading shows black, and nothing is scattered"
+
+    def replaced(self, **parts: Any) -> "Scene":
+        """The scene with other parts, and without what these cannot carry: shadows go with the last light that casts them and the last part
+        that shows them, the material and the radiance transfer with the environment."""
+        light, shading, scattering = (parts.get(name, getattr(self, name)) for name in ("lights", "shading", "scattering"))
+        if not any(isinstance(x, AbstractLight) and x.casts_shadows for x in light) or (shading is None and scattering is None):
+            parts["shadows"] = None
+        if parts.get("environment", self.environment) is None:
+            parts |= {"environment": None, "material": None, "radiance_transfer": None}
+        return dataclasses.replace(self, **parts)
 
     @property
     def material_order(self) -> int:

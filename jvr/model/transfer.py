@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.parameters import assign, parameter
+from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.ranges import COLOUR, EXTINCTION, INCREASING, POSITIVE
 from jvr.numerics import clamp, divide_or_zero, read_run
 from jvr.types import ArrayLike, Channels, Scalar, Triple
@@ -27,11 +28,20 @@ def extinction() -> Any:
     return parameter(EXTINCTION, shapes=(("n",), ("n", 3)), doc="extinction", unit="1 / mm")
 
 
-class AbstractTransfer(eqx.Module):
+class AbstractTransfer(AbstractPart):
     """A map from the scalar `s` (in the data's own units) to source colour and extinction."""
 
     # Whether `evaluate` takes the length of the gradient (per world length) as well.
     takes_gradient: ClassVar[bool] = False
+
+    @property
+    def needs_gradient(self) -> bool:
+        return self.takes_gradient
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        arguments = (scene.volume.slope,) * (2 if self.takes_gradient else 1)
+        coloured = len(jax.eval_shape(self.evaluate, *arguments).sigma_t) == 3
+        return (PlanEntry(name, True, f"{type(self).__name__}, {'coloured' if coloured else 'grey'} extinction"),)
 
     @abc.abstractmethod
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:

@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import functools
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder
 from jvr.model.kept import is_made_of, made_by, note_sources
 from jvr.model.packing import Squares, squares_of
+from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.voxels import CELL, VOXEL, as_missing, in_memory, masked_voxels, typical_range, without_gaps
 from jvr.numerics import add_runs, read_at, read_run, transformed, turned
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
@@ -74,7 +75,7 @@ def _linear(x: Scalar, n: int) -> tuple[Int[Array, ""], tuple[Scalar, ...]]:
     return low.astype(jnp.int32), (1 - (x - low), x - low)
 
 
-class Volume(eqx.Module):
+class Volume(AbstractPart):
     """A scalar field sampled on a regular, possibly oblique and anisotropic grid.
 
     Voxel `(i, j, k)` of `values[i, j, k]` sits at `world_from_grid @ (i, j, k, 1)`; the domain is the hull of the samples,
@@ -239,6 +240,10 @@ class Volume(eqx.Module):
         if squares is not None:
             note_sources(squares.entries, self.values)
         return eqx.tree_at(lambda v: v.squares, volume, squares)
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        voxels = f"{'x'.join(map(str, self.shape))} {self.values.dtype}, {type(self.interpolation).__name__.lower()}"
+        return (PlanEntry(name, True, f"{voxels}, a sample every {settings.step:g} voxels"),)
 
     def _repr_html_(self) -> str:
         """What notebooks show: the middle slices."""

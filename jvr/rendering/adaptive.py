@@ -20,7 +20,6 @@ from jvr.model.scene import Scene
 from jvr.model.transfer import LinearTransfer, LutTransfer
 from jvr.model.volume import Trilinear
 from jvr.rendering.image import Rendering, RenderStats
-from jvr.rendering.medium import is_lit
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Slices, SliceStats
 from jvr.rendering.settings import Settings
@@ -84,7 +83,7 @@ def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
     if not isinstance(scene.volume.interpolation, Trilinear):
         name = type(scene.volume.interpolation).__name__
         raise ValueError(f"jvr.Slices() interpolates between samples, which {name}() volumes do not allow: {UNIFORM}")
-    if is_lit(scene):
+    if scene.shows_light:
         raise ValueError(f"jvr.Slices() does not know light: {UNIFORM}, or take shading and scattering out of the scene")
     if not isinstance(settings.adjoint, Replay):
         raise ValueError(

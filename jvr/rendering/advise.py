@@ -4,24 +4,28 @@ import dataclasses
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jvr.march.quadrature import Midpoint
-from jvr.model.by_value import ByValue
 from jvr.model.camera import AbstractCamera
-from jvr.model.effects import spelling
-from jvr.model.gradient_transfer import GradientOpacity
-from jvr.model.light import AbstractLight, AmbientLight
-from jvr.model.normals import AnalyticGradient
+from jvr.model.parts import AbstractPart, parts_of, spelling, with_part
 from jvr.model.scene import Scene
 from jvr.rendering.image import render
 from jvr.rendering.settings import Settings
 
 Variant = tuple[Scene, Settings]
 Change = Callable[[Scene, Settings], Variant]
+
+
+class Candidate(NamedTuple):
+    """A change of a variant: where, what it is called, and what makes it; that raises `ValueError` where it cannot be made."""
+
+    place: str
+    title: str
+    change: Change
+
 
 # A change that saves less of the time than this is noise.
 LEAST_SAVING = 0.05
@@ -89,77 +93,48 @@ def advise(
             f"tolerance must be a positive difference of radiance, not {tolerance!r}; 1/255 is one step of an 8-bit picture"
         )
     picture, seconds = _timed(scene, camera, settings, repeats)
-    contributions, candidates = [], []
-    for effect, change in effects_of(scene):
-        rmse, without = _difference(change, (scene, settings), camera, picture, repeats)
-        contributions.append(Contribution(effect, rmse, 1 - without / seconds))
-        candidates.append((f"drop {effect}", change, rmse, without))
+    measured = lambda one: (one, *_difference(one.change, (scene, settings), camera, picture, repeats))
+    dropped = [measured(effect) for effect in effects_of(scene)]
+    contributions = tuple(Contribution(effect.title, rmse, 1 - without / seconds) for effect, rmse, without in dropped)
     proposal = None
     if tolerance is not None:
-        for name, change in _coarser(scene, settings):
-            candidates.append((name, change, *_difference(change, (scene, settings), camera, picture, repeats)))
+        candidates = [(one._replace(title=f"drop {one.title}"), rmse, without) for one, rmse, without in dropped]
+        candidates += [measured(notch) for notch in _coarser(scene, settings)]
         proposal = _proposal(candidates, (scene, settings), camera, picture, seconds, tolerance, repeats)
-    return Advice(
-        seconds, tuple(contributions), tuple(remarks_on(scene, render(scene, camera, settings).stats.shadows)), proposal
-    )
+    remarks = tuple(remarks_on(scene, render(scene, camera, settings).stats))
+    return Advice(seconds, contributions, remarks, proposal)
 
 
-def effects_of(scene: Scene) -> Iterator[tuple[str, Change]]:
+def effects_of(scene: Scene) -> Iterator[Candidate]:
     """Every effect that a scene may do without, and how."""
-    lit = scene.shading is not None or scene.scattering is not None
-    if scene.shadows is not None:
-        yield f"shadows {spelling(scene.shadows)}", lambda s, settings: (dataclasses.replace(s, shadows=None), settings)
-    if scene.shading is not None:
-        yield f"shading {spelling(scene.shading)}", lambda s, settings: (_without(s, shading=None), settings)
-    if scene.scattering is not None:
-        yield f"scattering {spelling(scene.scattering)}", lambda s, settings: (_without(s, scattering=None), settings)
-    if isinstance(scene.transfer, GradientOpacity):
-        inner = scene.transfer.transfer
-        yield "gradient opacity", lambda s, settings: (dataclasses.replace(s, transfer=inner), settings)
-    if scene.radiance_transfer is not None:
-        yield (
-            f"radiance transfer {spelling(scene.radiance_transfer)}",
-            lambda s, x: (dataclasses.replace(s, radiance_transfer=None), x),
-        )
-    if scene.environment is not None:
-        none = {"environment": None, "material": None, "radiance_transfer": None}
-        yield f"environment and material {spelling(scene.material)}", lambda s, x: (dataclasses.replace(s, **none), x)
-    for i, light in enumerate(scene.lights if lit and len(scene.lights) > 1 else ()):
-        keep = lambda s, settings, light=light: (_without(s, lights=tuple(x for x in s.lights if x is not light)), settings)
-        yield f"lights[{i}] {type(light).__name__}", keep
+    for name, part in parts_of(scene):
+        if part.without(scene) is not None:
+            yield Candidate(name, part.title(name, scene), lambda s, settings, part=part: (_without(s, part), settings))
 
 
-def _without(scene: Scene, **parts: Any) -> Scene:
-    """The scene with some parts replaced; shadows go with the last light that casts them and the last effect that shows them."""
-    light, shading, scattering = (parts.get(name, getattr(scene, name)) for name in ("lights", "shading", "scattering"))
-    casts = any(isinstance(x, AbstractLight) and x.casts_shadows for x in light)
-    if not casts or (shading is None and scattering is None):
-        parts["shadows"] = None
-    return dataclasses.replace(scene, **parts)
+def _without(scene: Scene, part: AbstractPart) -> Scene:
+    found = part.without(scene)
+    if found is None:
+        raise ValueError("what is left of the scene cannot do without")
+    return found
 
 
-def _coarser(scene: Scene, settings: Settings) -> Iterator[tuple[str, Change]]:
+def _coarser(scene: Scene, settings: Settings) -> Iterator[Candidate]:
     """What has a knob, one notch coarser."""
-    if scene.shadows is not None:
-        for coarser in scene.shadows.coarser():
-            yield f"shadows = {spelling(coarser)}", lambda s, x, new=coarser: (dataclasses.replace(s, shadows=new), x)
-    if scene.radiance_transfer is not None:
-        for coarser in scene.radiance_transfer.coarser():
-            yield (
-                f"radiance transfer = {spelling(coarser)}",
-                lambda s, x, new=coarser: (dataclasses.replace(s, radiance_transfer=new), x),
+    for name, part in parts_of(scene):
+        for new in part.coarser(scene):
+            yield Candidate(name, f"{name} = {spelling(new)}", lambda s, x, name=name, new=new: (with_part(s, name, new), x))
+    for knob in settings.knobs(scene):
+        value = knob.coarser(getattr(settings, knob.name))
+        if value is not None:
+            said = f"{value:g}" if isinstance(value, float) else spelling(value)
+            yield Candidate(
+                knob.name, f"{knob.name} = {said}", lambda s, x, name=knob.name, value=value: (s, x.turned(name, value))
             )
-    if type(scene.normals) is not AnalyticGradient:
-        analytic = AnalyticGradient(scene.normals.of_opacity)
-        yield f"normals = {spelling(analytic)}", lambda s, x: (dataclasses.replace(s, normals=analytic), x)
-    if isinstance(settings.quadrature, Midpoint):
-        yield f"step = {2 * settings.step:g}", lambda s, x: (s, dataclasses.replace(x, step=2 * x.step))
-    if settings.termination < 1e-2:
-        yield "termination = 0.01", lambda s, x: (s, dataclasses.replace(x, termination=1e-2))
 
 
 def _proposal(
-    candidates: list[tuple[str, Change, float, float]],
+    candidates: list[tuple[Candidate, float, float]],
     variant: Variant,
     camera: AbstractCamera,
     picture: np.ndarray,
@@ -168,24 +143,23 @@ def _proposal(
     repeats: int,
 ) -> Proposal:
     """Makes the changes that save most first, each only if all so far together stay within the tolerance."""
-    made, rmse = [], 0.0
-    worth = [c for c in candidates if c[2] <= tolerance and (c[3] < (1 - LEAST_SAVING) * seconds or c[0].startswith("drop"))]
-    knobs = set()
-    for name, change, _, _ in sorted(worth, key=lambda c: c[3]):
-        # One value for each knob, and none for what has been dropped.
-        knob = name.removeprefix("drop ").split(" ")[0]
-        if knob in knobs:
+    made, rmse, places = [], 0.0, set()
+    saves = lambda one, without: without < (1 - LEAST_SAVING) * seconds or one.title.startswith("drop")
+    worth = [(one, without) for one, difference, without in candidates if difference <= tolerance and saves(one, without)]
+    for one, _ in sorted(worth, key=lambda c: c[1]):
+        # One change in each place; what has been dropped together with another part cannot be changed.
+        if one.place in places:
             continue
         try:
-            changed = change(*variant)
+            changed = one.change(*variant)
         except ValueError:
             continue
         together, took = _timed(changed[0], camera, changed[1], repeats)
         difference = _rms(together - picture)
         if difference <= tolerance:
             variant, rmse, seconds = changed, difference, took
-            made.append(name)
-            knobs.add(knob)
+            made.append(one.title)
+            places.add(one.place)
     return Proposal(tuple(made), rmse, seconds, *variant)
 
 
@@ -212,31 +186,7 @@ def _rms(difference: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(difference))))
 
 
-def remarks_on(scene: Scene, shadow_stats: Any) -> Iterator[str]:
-    """What a present value cannot show, and what shadows have to report."""
-    for i, light in enumerate(scene.lights):
-        strength = next(getattr(light, name) for name in ("irradiance", "intensity", "radiance") if hasattr(light, name))
-        if not np.any(np.asarray(strength)):
-            yield f"lights[{i}] {type(light).__name__} has no strength: it is computed and adds nothing"
-        elif scene.shading is None and scene.scattering is None:
-            yield f"lights[{i}] {type(light).__name__} is not seen: nothing reflects or scatters it"
-        if scene.scattering is None and isinstance(light, AmbientLight) and _is_zero(getattr(scene.shading, "ambient", None)):
-            yield f"lights[{i}] AmbientLight is not seen: shading.ambient is zero"
-    if not scene.lights and (scene.shading is not None or scene.scattering is not None):
-        yield "there is no light: shading shows black, and nothing is scattered"
-    if scene.scattering is not None and _is_zero(getattr(scene.scattering, "albedo", None)):
-        yield "scattering.albedo is zero everywhere: nothing is scattered"
-    if scene.shading is not None and all(_is_zero(getattr(scene.shading, k, 0.0)) for k in ("diffuse", "specular")):
-        yield "shading.diffuse and shading.specular are zero: nothing but ambient light is reflected"
-    if scene.environment is not None and not np.any(np.asarray(scene.environment.coefficients)):
-        yield "environment has no strength: it is computed and adds nothing"
-    if scene.radiance_transfer is not None:
-        yield from scene.radiance_transfer.stale(scene)
-    if shadow_stats is not None and float(shadow_stats.overflow) > 0:
-        share, error = float(shadow_stats.overflow), float(shadow_stats.error)
-        yield f"{share:.0%} of the rays of a deep shadow map ran out of layers (error {error:.2g}): give it more"
-
-
-def _is_zero(value: Any) -> bool:
-    array = value.values if isinstance(value, ByValue) else value
-    return array is not None and not np.any(np.asarray(array))
+def remarks_on(scene: Scene, stats: Any) -> Iterator[str]:
+    """What does not show though it is there, and what the `RenderStats` of a picture have to report."""
+    for name, part in [*parts_of(scene), ("", scene)]:
+        yield from part.remarks(name, scene, stats)

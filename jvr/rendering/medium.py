@@ -36,8 +36,8 @@ def medium(
     frame, normals = _gradients(scene)
     field = VoxelField(scene.volume, normals)
     quadrature = settings.quadrature
-    pre_integrated = isinstance(quadrature, PreIntegrated)
-    if is_lit(scene):
+    pre_integrated = quadrature.pre_integrates
+    if scene.shows_light:
         shader = _lit_shader(scene, frame, pre_integrated, environment)
     else:
         shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
@@ -46,11 +46,6 @@ def medium(
     # Checks the transfer function's type itself.
     table = PreIntegratedTable(cast(Any, scene.transfer), quadrature.parts)
     return Medium(field, table, shader, occupancy, shadows)
-
-
-def is_lit(scene: Scene) -> bool:
-    """Whether anything in a scene shows light."""
-    return scene.shading is not None or scene.scattering is not None or scene.material is not None
 
 
 def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool, environment: Any) -> AbstractShader:
@@ -68,7 +63,7 @@ def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool,
 
 def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
     """How gradients come about, where something asks for them."""
-    if not needs_gradient(scene):
+    if not scene.needs_gradient:
         return None, None
     if scene.normals.of_opacity and scene.transfer.takes_gradient:
         raise ValueError("a transfer function of the gradient needs that of the scalar: set normals=...(of_opacity=False)")
@@ -78,25 +73,9 @@ def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | No
     return GradientFrame(eqx.filter(normals, False), volume.axes_inverse, volume.intercept, volume.shape), normals
 
 
-def needs_gradient(scene: Scene) -> bool:
-    """Whether anything in a scene asks for gradients."""
-    asks = scene.shading is not None or scatters_by_gradient(scene) or scene.transfer.takes_gradient
-    return asks or (scene.material is not None and scene.material.needs_gradient)
-
-
-def scatters_by_gradient(scene: Scene) -> bool:
-    """Whether the medium scatters only where the gradient is weak."""
-    return scene.scattering is not None and scene.scattering.needs_gradient
-
-
 def delta_lights(scene: Scene) -> tuple[AbstractLight, ...]:
     """The lights that come from one direction at each point (delta lights)."""
     return tuple(light for light in scene.lights if isinstance(light, AbstractLight))
-
-
-def prepares_light(scene: Scene) -> bool:
-    """Whether there is light that is prepared once for a picture, with derivatives of its own."""
-    return scene.shadows is not None or scene.radiance_transfer is not None or scene.material is not None
 
 
 def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility | None:
@@ -111,7 +90,7 @@ def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility 
         return shadows
     from jvr.effects.radiance_transfer_grid import radiance_transfer_visibility
 
-    medium = absorbing(scene, occupancy, scene.transfer.takes_gradient or scene.radiance_transfer.needs_gradient)
+    medium = absorbing(scene, occupancy, scene.transfer.takes_gradient or scene.radiance_transfer.rays_need_gradient)
     return radiance_transfer_visibility(scene, medium, shadows, len(delta_lights(scene)))
 
 

@@ -2,12 +2,13 @@
 
 import abc
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Int
 
 from jvr.march.oracle import AbstractOracle, LocalError
+from jvr.model.parts import AbstractPart, PlanEntry
 
 if TYPE_CHECKING:
     # What renders knows the settings, which know this.
@@ -16,13 +17,19 @@ if TYPE_CHECKING:
 TILES = (2, 4, 8, 16, 32, 64)
 
 
-class AbstractSampling(eqx.Module):
+class AbstractSampling(AbstractPart):
     """A choice of samples. Static, without arrays."""
+
+    # Whether samples that could be seen are left out.
+    leaves_out: ClassVar[bool] = True
 
     @property
     @abc.abstractmethod
     def explanation(self) -> str:
         """What it does, for `jvr.plan`."""
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        return (PlanEntry("adaptive sampling", self.leaves_out, self.explanation),)
 
     @abc.abstractmethod
     def render(self, scene: Any, camera: Any, settings: Any) -> "Rendering":
@@ -31,6 +38,8 @@ class AbstractSampling(eqx.Module):
 
 class Uniform(AbstractSampling):
     """Uniform sampling: every pixel's ray, and every sample of a ray that can be seen. The default."""
+
+    leaves_out: ClassVar[bool] = False
 
     @property
     def explanation(self) -> str:

@@ -1,15 +1,24 @@
 """How a scene is rendered: everything that changes time and accuracy, and nothing that changes the scene."""
 
 import math
+from typing import Any
 
 import equinox as eqx
 
 from jvr.march.differentiation import AbstractAdjoint, Replay
-from jvr.march.quadrature import AbstractQuadrature, Midpoint
+from jvr.march.quadrature import AbstractQuadrature, Midpoint, PreIntegrated
+from jvr.model.parts import AbstractPart, Knob, PlanEntry
 from jvr.rendering.sampling import AbstractSampling, Uniform
 
+# Values of its knobs, the coarsest first.
+STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
+TERMINATIONS = (1e-2, 1e-4)
+NEGLIGIBLE = (1e-2, 1e-3, 0.0)
+# Segments of a reference for each of the finest setting's.
+FINER = 4
 
-class Settings(eqx.Module):
+
+class Settings(AbstractPart):
     """Static choices of a rendering; hashable, without arrays, so `jax.jit(jvr.render)` works as it is.
 
     **Arguments:**
@@ -80,3 +89,30 @@ class Settings(eqx.Module):
         self.adjoint = adjoint
         self.sampling = sampling
         self.tile = tile
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        absorbs, ends = scene.optical.absorbs, self.termination > 0
+        limit = f"rays end at transmittance {self.termination:g}" if ends else "rays run to their end"
+        return (
+            PlanEntry("empty-space skipping", self.skipping, self._skipped(scene)),
+            PlanEntry("early termination", ends and absorbs, limit if absorbs else "nothing absorbs"),
+        )
+
+    def _skipped(self, scene: Any) -> str:
+        if not self.skipping:
+            return "every sample is taken"
+        bound = f", and those of optical depth below {self.negligible:g} a ray" if self.negligible else ""
+        bricks = scene.volume.bricks
+        if bricks is None:
+            return f"empty bricks{bound}; they are bounded anew for each picture: jvr.Volume.bricked() does it once"
+        return f"empty bricks of {bricks.size}^3 voxels{bound}; bounded anew inside of a jit that takes the voxels as an argument"
+
+    def knobs(self, scene: Any) -> tuple[Knob, ...]:
+        quadratures = tuple(rule for rule in (Midpoint(), PreIntegrated()) if rule.integrates(scene.transfer))
+        termination = (Knob("termination", TERMINATIONS, 0.0),) if scene.optical.absorbs else ()
+        return (
+            Knob("step", STEPS, STEPS[-1] / FINER),
+            Knob("quadrature", quadratures, Midpoint()),
+            *termination,
+            Knob("negligible", NEGLIGIBLE, 0.0),
+        )
