@@ -27,7 +27,7 @@ from jvr.io.config import build_fit, build_scene, config_from
 from jvr.io.config.schema.parts import BASES, WRITTEN, PartTable, table_of
 from jvr.io.kinds import KINDS, class_named
 from jvr.model.effects import AbstractShading, AbstractShadows
-from jvr.model.light import AbstractLight
+from jvr.model.light import AbstractEmitter
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
 from jvr.model.phase import AbstractPhase
@@ -157,7 +157,7 @@ def test_saved_scenes_are_valid(block, tmp_path):
 
 
 FAMILIES = {
-    "[[lights]]": AbstractLight,
+    "[[lights]]": AbstractEmitter,
     "[shading]": AbstractShading,
     "[shadows]": AbstractShadows,
     "[scattering.phase]": AbstractPhase,
