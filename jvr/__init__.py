@@ -72,6 +72,8 @@ if TYPE_CHECKING:
     from jvr.model.environment import EnvironmentLight as EnvironmentLight
     from jvr.model.gradient_transfer import GradientOpacity as GradientOpacity
     from jvr.model.gradient_transfer import GradientTransfer as GradientTransfer
+    from jvr.model.interpolation import Nearest as Nearest
+    from jvr.model.interpolation import Trilinear as Trilinear
     from jvr.model.light import AmbientLight as AmbientLight
     from jvr.model.light import DirectionalLight as DirectionalLight
     from jvr.model.light import HeadLight as HeadLight
@@ -104,8 +106,6 @@ if TYPE_CHECKING:
     from jvr.model.transfer import GaussianTransfer as GaussianTransfer
     from jvr.model.transfer import LinearTransfer as LinearTransfer
     from jvr.model.transfer import LutTransfer as LutTransfer
-    from jvr.model.volume import Nearest as Nearest
-    from jvr.model.volume import Trilinear as Trilinear
     from jvr.model.volume import Volume as Volume
     from jvr.pictures import linear_from_srgb as linear_from_srgb
     from jvr.pictures import srgb_from_linear as srgb_from_linear

@@ -105,6 +105,11 @@ def test_a_module_imports_only_from_modules_before_it(path):
             assert _part(MODULES[path]) == "cli", f"{MODULES[path]} imports the public names"
 
 
+def test_a_file_tells_one_story():
+    lengths = {name: len(path.read_text(encoding="utf-8").splitlines()) for path, name in MODULES.items()}
+    assert {name: n for name, n in lengths.items() if n > 400} == {}
+
+
 def test_no_cycles():
     """Also not within a part, among imports at the top of files."""
     graph = {name: {i for i in _imports(path, top_level_only=True) if i != name} for path, name in MODULES.items()}

@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jvr.model.interpolation import Nearest, Trilinear
 from jvr.model.parameters import choice
 from jvr.model.parts import AbstractPart, Knob, PlanEntry, parts_of, spelling
 from jvr.model.transfer import AbstractTransfer
-from jvr.model.volume import Nearest, Trilinear, Volume, gradients_at_voxels
+from jvr.model.volume import Volume, gradients_at_voxels
 from jvr.numerics import add_runs, divide_or_zero, read_run
 from jvr.types import Channels, Scalar, Triple
 

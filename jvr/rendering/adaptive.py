@@ -15,10 +15,10 @@ from jvr.march.slices import Slices as Sliced
 from jvr.march.slices_adjoint import replay_slices
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
+from jvr.model.interpolation import Trilinear
 from jvr.model.preintegration import PreIntegratedTable
 from jvr.model.scene import Scene
 from jvr.model.transfer import LinearTransfer, LutTransfer
-from jvr.model.volume import Trilinear
 from jvr.rendering.image import Rendering, RenderStats
 from jvr.rendering.pixels import ImagePlane, image_plane
 from jvr.rendering.sampling import Slices, SliceStats

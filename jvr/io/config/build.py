@@ -23,10 +23,11 @@ from jvr.march.differentiation import Forward, Replay, Rows
 from jvr.march.oracle import BrickRange, Finest, LocalError, OpacityChange
 from jvr.march.quadrature import Midpoint, PreIntegrated
 from jvr.model.camera import AbstractCamera, PerspectiveCamera, fibonacci_sphere
+from jvr.model.interpolation import Nearest, Trilinear
 from jvr.model.optical import AbsorptionOnly, EmissionAbsorption, EmissionOnly
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTransfer, LutTransfer
-from jvr.model.volume import Nearest, Trilinear, Volume
+from jvr.model.volume import Volume
 from jvr.rendering.image import render
 from jvr.rendering.sampling import AbstractSampling, Refinement, Slices, Uniform
 from jvr.rendering.settings import Settings
