@@ -20,7 +20,7 @@ from jvr.io.config.schema.parts import table_of
 from jvr.io.kinds import KINDS, PARTS
 from jvr.io.reference import markdown, public_parameters
 from jvr.model.exact import Exact
-from jvr.model.light import AbstractLight, LightSample
+from jvr.model.light import AbstractEmitter, AbstractLight, LightSample
 from jvr.model.parameters import GREY_OR_RGB, alternatives, assign, choice, declared, parameter, parts_of, range_at
 from jvr.model.phase import AbstractPhase, ScatteringAngle, components
 from jvr.model.ranges import ANY, RADIANCE, Interval
@@ -68,8 +68,15 @@ class LinearPhase(AbstractPhase):
         return tuple(b / 3 for (b,) in components(self.b))
 
 
-jvr.register("lamp", LampLight)
-jvr.register("linear", LinearPhase)
+@pytest.fixture(scope="module", autouse=True)
+def _registered():
+    """Known to files while these tests run, and not to others."""
+    jvr.register("lamp", LampLight)
+    jvr.register("linear", LinearPhase)
+    yield
+    for family, kind, name in ((AbstractEmitter, "lamp", "LampLight"), (AbstractPhase, "linear", "LinearPhase")):
+        del KINDS[family][kind], PARTS[name]
+
 
 CONFIG = """
 [volume]
