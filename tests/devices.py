@@ -60,7 +60,9 @@ def test_there_are_three():
     [
         ("plain", (15, 13)),
         pytest.param("plain", (1, 1), marks=slow),
-        *(pytest.param(name, (15, 13), marks=slow) for name in SCENES if name != "plain"),
+        # An even number of columns: the ray in the middle of an odd one has a sample in a voxel, where the gradient jumps, and rounding
+        # decides on which side it is.
+        *(pytest.param(name, (16, 13), marks=slow) for name in SCENES if name != "plain"),
     ],
 )
 def test_pictures(name, size):

@@ -23,7 +23,9 @@ loss = lambda arrays: jnp.mean(jnp.sin(3 * jvr.render(eqx.tree_at(into, scene, a
 picture, gradient = jvr.render(scene, camera), jax.grad(loss)(into(scene))
 colours = lambda scene: scene.transfer.rgb
 start = eqx.tree_at(colours, scene, jnp.full_like(colours(scene), 0.5))
-fitted = jvr.fit(start, [camera], [np.asarray(picture.rgb)], unknowns=colours, max_steps=4, progress=False)
+# Noise, since standard errors of a perfect fit would be those of rounding.
+target = np.asarray(picture.rgb) + 0.02 * np.random.default_rng(0).normal(size=picture.rgb.shape)
+fitted = jvr.fit(start, [camera], [target], unknowns=colours, max_steps=4, progress=False)
 arrays = {"rgb": picture.rgb, "depth": picture.depth, "steps": picture.stats.steps}
 arrays |= {"of_colours": gradient[0].rgb, "of_extinctions": gradient[0].sigma_t, "of_voxels": gradient[1]}
 np.savez(file, fitted=fitted.scene.transfer.rgb, errors=fitted.standard_errors, **arrays)

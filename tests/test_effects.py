@@ -210,8 +210,9 @@ def test_advice_measures_what_effects_show():
     one = dataclasses.replace(one, lights=one.lights[1:], shading=None)
     found = jvr.advise(one, camera, repeats=1)
     shadows, scattering = found.contributions
-    assert scattering.rmse == 0
-    assert shadows.rmse == 0
+    # Programs with and without an effect that adds nothing differ by rounding.
+    assert scattering.rmse < 1e-7
+    assert shadows.rmse < 1e-7
     assert "scattering SingleScattering(Isotropic)" in str(found)
 
 

@@ -1,6 +1,6 @@
 """Kinds of unknowns: how each acts on a picture, and so which way its derivative comes.
 
-That is told by where an array is in the scene and by what its class declares (`jvr.model.ranges`), never by its name: an array of a
+That is told by where an array is in the scene and by what its class declares (`jvr.model.parameters`), never by its name: an array of a
 class that nobody has thought of is differentiated in forward mode through the whole march.
 """
 
