@@ -84,7 +84,7 @@ def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> 
     """`render` with every ray and every visible sample."""
     if is_traced() and not is_spread():
         # A part of somebody's program, in which arrays that it closes over are constants.
-        return _render(scene, camera, settings, settings.step)
+        return _render(scene, camera, settings)
     # The step is an argument of the program: with another one nothing is compiled again.
     same = dataclasses.replace(settings, step=1.0)
     if is_traced((scene, camera)) or is_spread():
@@ -93,7 +93,7 @@ def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> 
     return within_memory(lambda tile: _picture(scene, camera, dataclasses.replace(same, tile=tile), settings.step), settings.tile)
 
 
-def _render(scene: Scene, camera: AbstractCamera, settings: Settings, step: Scalar | float) -> Rendering:
+def _render(scene: Scene, camera: AbstractCamera, settings: Settings, step: Scalar | float | None = None) -> Rendering:
     height, width = camera.height, camera.width
     most = settings.tile // math.prod(block_shape(height, width))
 

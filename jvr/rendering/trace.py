@@ -23,11 +23,11 @@ FAR = 2.0
 
 
 def prepare(scene: Scene, settings: Settings, step: Scalar | float | None = None) -> Prepared:
-    """What rays through a scene need to know beforehand, computed once. `step`: in place of that of the settings; may be traced, so that
-    one program serves all steps."""
+    """What rays through a scene need to know beforehand, computed once. `step`: in place of that of the settings; traced, one
+    program serves all steps."""
     (scene,) = near_volume(scene)
     occupied = occupancy(scene, settings)
-    dt = (settings.step if step is None else step) * jnp.min(scene.volume.spacing)
+    dt = None if step is None else step * jnp.min(scene.volume.spacing)
     return Prepared(occupied, visibility(scene, occupied), environment(scene), dt)
 
 
