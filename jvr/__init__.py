@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from jvr.fitting.residuals import residuals as residuals
     from jvr.io.exported import use_export as use_export
     from jvr.io.images import read_image as read_image
+    from jvr.io.kinds import register as register
     from jvr.io.precompute import precompute as precompute
     from jvr.io.scenes import load_scene as load_scene
     from jvr.io.scenes import save_scene as save_scene

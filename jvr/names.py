@@ -26,6 +26,7 @@ NAMES = {
     "jvr.fitting.bijectors": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
     "jvr.io.exported": ("use_export",),
     "jvr.io.images": ("read_image",),
+    "jvr.io.kinds": ("register",),
     "jvr.io.precompute": ("precompute",),
     "jvr.io.scenes": ("load_scene", "save_scene"),
     "jvr.io.volumes": ("read_volume",),

@@ -299,8 +299,8 @@ ERRORS = {
     "negative specular": (lambda: jvr.PhongBRDF(0.5, -0.1), "specular must be in [0, 1]"),
     "negative exponent": (lambda: jvr.BlinnPhongBRDF(exponent=-1.0), "exponent must be finite and not negative"),
     "coloured exponent": (lambda: jvr.PhongBRDF(exponent=[1.0, 2.0, 3.0]), "exponent has shape (3,)"),
-    "roughness 0": (lambda: jvr.MicrofacetBRDF(roughness=0.0), "roughness must be in 0.001 ... 1"),
-    "roughness NaN": (lambda: jvr.MicrofacetBRDF(roughness=np.nan), "roughness must be in 0.001 ... 1"),
+    "roughness 0": (lambda: jvr.MicrofacetBRDF(roughness=0.0), "roughness must be in [0.001, 1]"),
+    "roughness NaN": (lambda: jvr.MicrofacetBRDF(roughness=np.nan), "roughness must be in [0.001, 1]"),
     "metallic 2": (lambda: jvr.MicrofacetBRDF(metallic=2.0), "metallic must be in [0, 1]"),
     "albedo above 1": (lambda: jvr.PhaseBRDF(jvr.Isotropic(), 1.1), "albedo must be in [0, 1]"),
 }

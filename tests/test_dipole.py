@@ -111,10 +111,13 @@ def test_finite_at_extremes(dtype):
     ("call", "says"),
     [
         (lambda: jvr.Dipole([1.0, 1.0], [0.0, 0.0, 0.0]), r"sigma_s_prime has shape \(2,\); it must be \(3,\)"),
-        (lambda: jvr.Dipole([1.0, 1.0, 0.0], [0.0, 0.0, 0.0]), "sigma_s_prime must be finite and positive"),
+        (lambda: jvr.Dipole([1.0, 1.0, 0.0], [0.0, 0.0, 0.0]), "sigma_s_prime must be positive and finite"),
         (lambda: jvr.Dipole([1.0, 1.0, 1.0], [0.0, -1.0, 0.0]), "sigma_a must be finite and not negative"),
         (lambda: jvr.Dipole([1.0, 1.0, 1.0], [0.0, np.nan, 0.0]), "sigma_a must be finite and not negative"),
-        (lambda: jvr.Dipole([1.0, 1.0, 1.0], [0.0, 0.0, 0.0], 0.5), r"eta, an index of refraction, must be in \[1, 3\]"),
+        (
+            lambda: jvr.Dipole([1.0, 1.0, 1.0], [0.0, 0.0, 0.0], 0.5),
+            r"eta must be in \[1, 3\] \(index of refraction; skin has 1.3\), not 0.5",
+        ),
         (lambda: jvr.Dipole.preset("jade"), "no translucent material is called 'jade'; there are apple, .*wholemilk"),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 from scenes import render_quickly
 
 import jvr
-from jvr.model.ranges import is_by_channel
+from jvr.model.parameters import is_by_channel
 
 SETTINGS = jvr.Settings(0.8)
 DIRECTION = np.array([0.3, 0.5, -1.0])

@@ -17,7 +17,8 @@ from jvr.fitting.problem import Problem
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 from jvr.model.effects import AbstractMaterial
 from jvr.model.light import AbstractLight, LightSample
-from jvr.model.ranges import INCREASING, NOT_NEGATIVE, UNIT_INTERVAL, UnitVector, within
+from jvr.model.parameters import parameter
+from jvr.model.ranges import DIRECTION, INCREASING, NOT_NEGATIVE, UNIT_INTERVAL
 from jvr.model.transfer import AbstractTable, Classified
 
 SETTINGS = jvr.Settings(0.9, termination=0.0)
@@ -26,9 +27,9 @@ SETTINGS = jvr.Settings(0.9, termination=0.0)
 class SquareRoots(AbstractTable):
     """A table whose entries lie evenly in the square root of the scalar, from `first` to `last`."""
 
-    span: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
-    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
-    sigma_t: Float[Array, "n"] = eqx.field(metadata=within(NOT_NEGATIVE))
+    span: Float[Array, "2"] = parameter(INCREASING, doc="span")
+    rgb: Float[Array, "n 3"] = parameter(UNIT_INTERVAL, doc="rgb")
+    sigma_t: Float[Array, "n"] = parameter(NOT_NEGATIVE, doc="sigma_t")
 
     @property
     def ends(self):
@@ -48,8 +49,8 @@ class SquareRoots(AbstractTable):
 class Sun(AbstractLight):
     """Parallel light."""
 
-    heading: Float[Array, "3"] = eqx.field(metadata=within(UnitVector()))
-    glow: Float[Array, "3"] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
+    heading: Float[Array, "3"] = parameter(DIRECTION, doc="direction")
+    glow: Float[Array, "3"] = parameter(NOT_NEGATIVE, by_channel=True, doc="glow")
 
     def sample(self, x, w_o):
         towards = -self.heading / jnp.linalg.norm(self.heading)
@@ -62,7 +63,7 @@ class Sun(AbstractLight):
 class Paint(AbstractMaterial):
     """A diffuse material whose reflectance is the square of its `depth`."""
 
-    depth: Float[Array, ""] = eqx.field(metadata=within(UNIT_INTERVAL))
+    depth: Float[Array, ""] = parameter(UNIT_INTERVAL, doc="depth")
 
     @property
     def needs_gradient(self):

@@ -354,7 +354,7 @@ def test_gradient_of_opacity_for_a_transfer_of_the_gradient_is_refused():
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: jvr.GradientTransfer(np.ones((1, 3, 3)), np.ones((1, 3)), [0, 1], [0, 1]), ValueError, "2 x 2"),
+        (lambda: jvr.GradientTransfer(np.ones((1, 3, 3)), np.ones((1, 3)), [0, 1], [0, 1]), ValueError, "at least 2"),
         (lambda: jvr.GradientTransfer(np.ones((2, 3, 3)), -np.ones((2, 3)), [0, 1], [0, 1]), ValueError, "not negative"),
         (lambda: jvr.GradientTransfer(np.ones((2, 3, 3)), np.ones((2, 2)), [0, 1], [0, 1]), ValueError, "shape"),
         (lambda: jvr.GradientTransfer(np.ones((2, 3, 3)), np.ones((2, 3)), [0, 1], [1, 1]), ValueError, "magnitudes"),

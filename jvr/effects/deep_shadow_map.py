@@ -10,12 +10,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.effects.light_space import AbstractLightSpace, bilinear, light_space, of_swept
-from jvr.effects.shadow_volume import check_size
+from jvr.effects.shadow_volume import texels
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
+from jvr.model.parameters import assign, choice
 from jvr.model.parts import Knob, multiples
+from jvr.model.ranges import AT_LEAST_ONE, FRACTION
 from jvr.model.scene import Scene
 from jvr.numerics import read_run, transformed
 from jvr.types import Affine, Channels, Scalar, Triple
@@ -35,16 +37,12 @@ class DeepShadowMap(AbstractShadows):
     made, 4 bytes for each voxel of the volume's diagonal and ray.
     """
 
-    texels: int = eqx.field(static=True)
-    layers: int = eqx.field(static=True)
-    error: float = eqx.field(static=True)
+    texels: int = texels()
+    layers: int = choice(AT_LEAST_ONE, doc="pieces along each ray of the map")
+    error: float = choice(FRACTION, doc="difference of transmittance")
 
     def __init__(self, texels: int = 128, layers: int = 12, *, error: float = 0.01):
-        check_size(texels, "texels", 2)
-        check_size(layers, "layers", 1)
-        if not isinstance(error, float) or not 0 < error < 1:
-            raise ValueError(f"error must be a difference of transmittance above 0 and below 1, not {error!r}")
-        self.texels, self.layers, self.error = texels, layers, error
+        assign(self, texels=texels, layers=layers, error=error)
 
     def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         steps = max(self.layers, math.ceil(math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape))))

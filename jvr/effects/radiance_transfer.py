@@ -18,10 +18,12 @@ from jaxtyping import Array, UInt32
 
 from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
 from jvr.model.dipole import Dipole
-from jvr.model.effects import AbstractRadianceTransfer
+from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
 from jvr.model.harmonics.basis import count
 from jvr.model.kept import content
+from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import AbstractPart, Knob, multiples
+from jvr.model.ranges import AT_LEAST_ONE, POSITIVE, TRANSMITTANCE, Interval
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
 from jvr.types import Scalar
@@ -29,13 +31,16 @@ from jvr.types import Scalar
 # How far above a node of a surface rays begin, in distances between nodes: from below a cell of the grid, up its diagonal, into the open.
 LIFT = 1.75
 
+ORDER = Interval(0.0, 10.0)
+SHARE = Interval(0.0, 1.0, "(]")
 
-class TransferBleeding(eqx.Module):
+
+class TransferBleeding(AbstractBleeding):
     """Colour bleeding of the transfer function's colours, which rays pick up of what they pass: materials may be exchanged without a new
     projection."""
 
 
-class MaterialBleeding(eqx.Module):
+class MaterialBleeding(AbstractBleeding):
     """Colour bleeding of what the material reflects towards the origin of a ray, times the transfer function's colour where that tints
     it: a new material needs a new projection."""
 
@@ -73,20 +78,20 @@ class RadianceTransfer(AbstractRadianceTransfer):
     may not, unless it is `pinned()`. **Raises** `ValueError` for numbers outside their ranges.
     """
 
-    order: int = eqx.field(static=True)
-    rays: int = eqx.field(static=True)
-    resolution: float = eqx.field(static=True)
-    bleeding: TransferBleeding | MaterialBleeding | None
-    scattering: Any
-    neighbourhood: float = eqx.field(static=True)
-    exact: bool = eqx.field(static=True)
-    chromaticity: int | None = eqx.field(static=True)
-    step: float = eqx.field(static=True)
-    growth: float = eqx.field(static=True)
-    termination: float = eqx.field(static=True)
-    surface: float = eqx.field(static=True)
-    memory: float = eqx.field(static=True)
-    projected: ProjectedRadianceTransfer | None
+    order: int = choice(ORDER, doc="order of the harmonics")
+    rays: int = choice(AT_LEAST_ONE, doc="rays for each node")
+    resolution: float = choice(SHARE, doc="nodes for each voxel along an axis")
+    bleeding: AbstractBleeding | None = parameter(doc="jvr.TransferBleeding(), jvr.MaterialBleeding() or None")
+    scattering: Dipole | None = parameter(doc='a jvr.Dipole, such as jvr.Dipole.preset("skin1"), or None')
+    neighbourhood: float = choice(SHARE, doc="radius as a share of the longest side")
+    exact: bool = choice(doc="whether samples take the triple product")
+    chromaticity: int | None = choice(ORDER, doc="order of colour differences")
+    step: float = choice(POSITIVE, doc="first step", unit="voxels")
+    growth: float = choice(AT_LEAST_ONE, doc="ratio of a step to the one before")
+    termination: float = choice(TRANSMITTANCE, doc="transmittance at which a ray ends, 0 for never")
+    surface: float = choice(POSITIVE, doc="change of transparency between nodes")
+    memory: float = choice(POSITIVE, doc="that coefficients may take", unit="bytes")
+    projected: ProjectedRadianceTransfer | None = parameter(doc="what has been computed beforehand")
 
     def __init__(
         self,
@@ -94,8 +99,8 @@ class RadianceTransfer(AbstractRadianceTransfer):
         rays: int = 64,
         resolution: float | int = 1 / 3,
         *,
-        bleeding: TransferBleeding | MaterialBleeding | None = None,
-        scattering: Any = None,
+        bleeding: AbstractBleeding | None = None,
+        scattering: Dipole | None = None,
         neighbourhood: float | int = 0.1,
         exact: bool = False,
         chromaticity: int | None = None,
@@ -105,31 +110,12 @@ class RadianceTransfer(AbstractRadianceTransfer):
         surface: float | int = 0.1,
         memory: float | int = 2e9,
     ):
-        if not isinstance(bleeding, TransferBleeding | MaterialBleeding | None):
-            raise TypeError(f"bleeding must be jvr.TransferBleeding(), jvr.MaterialBleeding() or None, not {bleeding!r}")
-        if not isinstance(scattering, Dipole | None):
-            raise TypeError(f'scattering must be a jvr.Dipole, such as jvr.Dipole.preset("skin1"), or None, not {scattering!r}')
-        is_integer = lambda x: isinstance(x, int) and not isinstance(x, bool)
-        wrong = {
-            "order must be a whole number from 0 to 10": not is_integer(order) or not 0 <= order <= 10,
-            "rays must be a whole number of at least 1": not is_integer(rays) or rays < 1,
-            "memory must be a positive number of bytes": not memory > 0,
-            "resolution must be above 0 and at most 1 nodes for each voxel": not 0 < resolution <= 1,
-            "neighbourhood must be above 0 and at most 1 of the longest side": not 0 < neighbourhood <= 1,
-            "step must be above 0 and growth at least 1": not (step > 0 and growth >= 1),
-            "termination must be a transmittance in [0, 1)": not 0 <= termination < 1,
-            "surface must be a positive change of transparency": not surface > 0,
-            "chromaticity must be None or an order up to that of the luminance, and needs bleeding": chromaticity is not None
-            and (bleeding is None or not 0 <= chromaticity <= order),
-        }
-        for message, is_wrong in wrong.items():
-            if is_wrong:
-                raise ValueError(f"{message}; see the docstring of RadianceTransfer for what the defaults are")
-        self.order, self.rays, self.exact, self.chromaticity = order, rays, bool(exact), chromaticity
-        self.resolution, self.neighbourhood, self.memory = float(resolution), float(neighbourhood), float(memory)
-        self.step, self.growth = float(step), float(growth)
-        self.termination, self.surface = float(termination), float(surface)
-        self.bleeding, self.scattering, self.projected = bleeding, scattering, None
+        assign(self, order=order, rays=rays, resolution=resolution, bleeding=bleeding, scattering=scattering)
+        assign(self, neighbourhood=neighbourhood, exact=exact, chromaticity=chromaticity, step=step, growth=growth)
+        assign(self, termination=termination, surface=surface, memory=memory)
+        if chromaticity is not None and (bleeding is None or chromaticity > order):
+            raise ValueError("chromaticity must be None or an order up to that of the luminance, and needs bleeding")
+        self.projected = None
 
     def stale(self, scene: Any) -> tuple[str, ...]:
         if self.projected is None or np.all(self.projected.is_for(self.cache_key(scene))):

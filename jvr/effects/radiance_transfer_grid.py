@@ -180,6 +180,7 @@ def scattered(scene: Scene, projected: ProjectedRadianceTransfer) -> ProjectedRa
     from jvr.effects.diffusion import scatter
 
     radiance_transfer = radiance_transfer_of(scene)
+    assert radiance_transfer.scattering is not None
     there = projected.solid > 0
     coefficients = scatter(
         radiance_transfer.scattering, radiance_transfer.neighbourhood, scene.volume, projected.coefficients, there

@@ -4,16 +4,13 @@ Eurographics 2009, chapters 7.1 to 7.4)."""
 from collections.abc import Iterator
 from typing import Any
 
-import equinox as eqx
-import numpy as np
-
 from jvr.effects.shading import surface_weight
-from jvr.model.by_value import ByValue, coefficient
-from jvr.model.checks import float_array, require
+from jvr.model.by_value import ByValue
 from jvr.model.effects import AbstractScattering
+from jvr.model.parameters import GREY_OR_RGB, assign, parameter
 from jvr.model.parts import is_zero
 from jvr.model.phase import AbstractPhase, Isotropic, ScatteringAngle
-from jvr.model.ranges import POSITIVE, UNIT_INTERVAL, within
+from jvr.model.ranges import POSITIVE, UNIT_INTERVAL
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 
@@ -31,9 +28,9 @@ class SingleScattering(AbstractScattering):
     With lights of unknown intensity, only the product of albedo and intensity can be seen in a picture. Differentiable in all numbers.
     """
 
-    phase: AbstractPhase
-    albedo: Any = eqx.field(metadata=within(UNIT_INTERVAL))
-    threshold: Scalar | None = eqx.field(metadata=within(POSITIVE))
+    phase: AbstractPhase = parameter(doc="a phase function such as jvr.HenyeyGreenstein(0.5)")
+    albedo: Any = parameter(UNIT_INTERVAL, shapes=GREY_OR_RGB, by_scalar=True, doc="share of the extinguished light")
+    threshold: Scalar | None = parameter(POSITIVE, doc="length of a gradient", unit="data units per mm")
 
     def __init__(
         self,
@@ -42,18 +39,7 @@ class SingleScattering(AbstractScattering):
         *,
         threshold: ArrayLike | None = None,
     ):
-        if not isinstance(phase, AbstractPhase):
-            raise TypeError(f"phase must be a phase function such as jvr.HenyeyGreenstein(0.5), not {type(phase).__name__}")
-        self.phase = phase
-        valid, message = UNIT_INTERVAL.holds, "albedo must be a share of the extinguished light, 0 to 1"
-        if not isinstance(albedo, ByValue) and np.ndim(albedo) == 1:
-            self.albedo = float_array(albedo, "albedo", (3,))
-            require(self.albedo, valid, message)
-        else:
-            self.albedo = coefficient(albedo, "albedo", valid, message)
-        self.threshold = None if threshold is None else float_array(threshold, "threshold", ())
-        if threshold is not None:
-            require(self.threshold, POSITIVE.holds, "threshold must be a positive length of the gradient, or None")
+        assign(self, phase=phase, albedo=albedo, threshold=threshold)
 
     def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
         if is_zero(self.albedo):

@@ -8,21 +8,22 @@ colour of the transfer function; the cosine is that of the angle between normal 
 from collections.abc import Iterator
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jvr.model.by_value import ByValue, coefficient
-from jvr.model.checks import float_array, require
+from jvr.model.by_value import ByValue
 from jvr.model.effects import AbstractShading
+from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import is_zero
-from jvr.model.ranges import NOT_NEGATIVE, Interval, within
+from jvr.model.ranges import AT_LEAST_ONE, NOT_NEGATIVE
 from jvr.numerics import direction_and_length, divide_or_zero, dot, larger, power_of_cosine, smaller
 from jvr.types import ArrayLike, Scalar, Triple
 
-# Of Phong's lobes.
-EXPONENT = Interval(low=1.0)
+
+def reflected(doc: str) -> Any:
+    """The declaration of a fraction that a surface reflects."""
+    return parameter(NOT_NEGATIVE, by_scalar=True, doc=doc)
 
 
 class Lambert(AbstractShading):
@@ -39,10 +40,10 @@ class Lambert(AbstractShading):
     Differentiable in all numbers; detached: which way a normal is turned.
     """
 
-    ambient: Any = eqx.field(metadata=within(NOT_NEGATIVE))
-    diffuse: Any = eqx.field(metadata=within(NOT_NEGATIVE))
-    threshold: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
-    two_sided: bool = eqx.field(static=True)
+    ambient: Any = reflected("share of ambient light")
+    diffuse: Any = reflected("share of the light")
+    threshold: Scalar = parameter(NOT_NEGATIVE, doc="length of a gradient", unit="data units per mm")
+    two_sided: bool = choice(doc="whether normals are turned to the eye")
 
     def __init__(
         self,
@@ -52,11 +53,7 @@ class Lambert(AbstractShading):
         threshold: ArrayLike = 0.0,
         two_sided: bool = True,
     ):
-        self.ambient = _fraction(ambient, "ambient")
-        self.diffuse = _fraction(diffuse, "diffuse")
-        self.threshold = float_array(threshold, "threshold", ())
-        require(self.threshold, NOT_NEGATIVE.holds, "threshold must be a length of the gradient, not negative")
-        self.two_sided = two_sided
+        assign(self, ambient=ambient, diffuse=diffuse, threshold=threshold, two_sided=two_sided)
 
     def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
         if is_zero(self.diffuse) and is_zero(getattr(self, "specular", 0.0)):
@@ -92,8 +89,8 @@ class Phong(Lambert):
     **Arguments:** as `Lambert`, and `specular`, not negative; `shininess`, at least 1. Each a number or `jvr.ByValue`.
     """
 
-    specular: Any = eqx.field(metadata=within(NOT_NEGATIVE))
-    shininess: Any = eqx.field(metadata=within(EXPONENT))
+    specular: Any = reflected("share of the light in the highlight")
+    shininess: Any = parameter(AT_LEAST_ONE, by_scalar=True, doc="exponent of the highlight", hint="30 is a soft one")
 
     def __init__(
         self,
@@ -106,8 +103,7 @@ class Phong(Lambert):
         two_sided: bool = True,
     ):
         super().__init__(ambient, diffuse, threshold=threshold, two_sided=two_sided)
-        self.specular = _fraction(specular, "specular")
-        self.shininess = coefficient(shininess, "shininess", EXPONENT.holds, "shininess must be an exponent of at least 1")
+        assign(self, specular=specular, shininess=shininess)
 
     def specular_lobe(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
         twice = 2 * dot(normal, w_i)
@@ -144,7 +140,3 @@ def surface_weight(magnitude: Float[Array, "..."], threshold: Scalar) -> Float[A
     weight = jnp.where(magnitude >= threshold, 1 / (1 + ratio), ratio / (1 + ratio))
     # A gradient that vanishes has no normal, whatever the threshold.
     return jnp.where(magnitude > 0, weight, jax.lax.stop_gradient(jnp.zeros_like(magnitude)))
-
-
-def _fraction(value: ArrayLike | ByValue, name: str) -> Any:
-    return coefficient(value, name, NOT_NEGATIVE.holds, f"{name} must be finite and not negative")

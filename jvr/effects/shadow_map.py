@@ -6,12 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jvr.effects.light_space import AbstractLightSpace, depth_nodes, light_space
-from jvr.effects.shadow_volume import check_size, samples_a_layer
+from jvr.effects.shadow_volume import samples_a_layer, texels
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
+from jvr.model.parameters import assign, choice
 from jvr.model.parts import Knob, multiples
+from jvr.model.ranges import FRACTION, NOT_NEGATIVE
 from jvr.model.scene import Scene
 from jvr.numerics import read_at, transformed
 from jvr.types import Affine, Channels, Scalar, Triple
@@ -32,19 +34,13 @@ class ShadowMap(AbstractShadows):
     depth in voxels that a point must be behind the map to be dark, against shadows of a surface on itself.
     """
 
-    texels: int = eqx.field(static=True)
-    threshold: float = eqx.field(static=True)
-    softness: int = eqx.field(static=True)
-    bias: float = eqx.field(static=True)
+    texels: int = texels()
+    threshold: float = choice(FRACTION, doc="opacity of an occluder")
+    softness: int = choice(NOT_NEGATIVE, doc="texels to each side")
+    bias: float = choice(NOT_NEGATIVE, doc="depth that a point is behind the map to be dark", unit="voxels")
 
     def __init__(self, texels: int = 256, *, threshold: float = 0.5, softness: int = 1, bias: float | int = 1.5):
-        check_size(texels, "texels", 2)
-        check_size(softness, "softness", 0)
-        if not isinstance(threshold, float) or not 0 < threshold < 1:
-            raise ValueError(f"threshold must be an opacity above 0 and below 1, not {threshold!r}")
-        if not isinstance(bias, int | float) or not 0 <= bias < float("inf"):
-            raise ValueError(f"bias must be a depth in voxels, not negative, not {bias!r}")
-        self.texels, self.threshold, self.softness, self.bias = texels, threshold, softness, float(bias)
+        assign(self, texels=texels, threshold=threshold, softness=softness, bias=bias)
 
     def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         maps = []

@@ -14,7 +14,9 @@ from jvr.march.steps import Point, Rays
 from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
+from jvr.model.parameters import assign, choice
 from jvr.model.parts import AbstractPart, Knob, multiples
+from jvr.model.ranges import POSITIVE, TRANSMITTANCE
 from jvr.model.scene import Scene
 from jvr.numerics import ray_box, smaller
 from jvr.types import Channels, Scalar
@@ -33,15 +35,11 @@ class ShadowRays(AbstractShadows):
     for each sample of the picture as the light's way through the volume has steps.
     """
 
-    step: float = eqx.field(static=True)
-    termination: float = eqx.field(static=True)
+    step: float = choice(POSITIVE, doc="length of a step", unit="voxels of the smallest spacing", hint="1 is a good start")
+    termination: float = choice(TRANSMITTANCE, doc="transmittance at which a shadow ray ends, 0 for never")
 
     def __init__(self, step: float | int = 1.0, *, termination: float | int = 1e-3):
-        if not isinstance(step, int | float) or not 0 < step < float("inf"):
-            raise ValueError(f"the step of shadow rays must be a positive number of voxels, not {step!r}; 1 is a good start")
-        if not isinstance(termination, int | float) or not 0 <= termination < 1:
-            raise ValueError(f"termination must be a transmittance in [0, 1), not {termination!r}")
-        self.step, self.termination = float(step), float(termination)
+        assign(self, step=step, termination=termination)
 
     def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         return RayVisibility(scene.clipping, lights, medium, self.step * spacing, MarchOptions(self.termination, distance=False))

@@ -1,6 +1,7 @@
 """Transmittance from the light, swept once through the volume and interpolated: shadow volumes and opacity shadow maps."""
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,10 +13,17 @@ from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractLight
+from jvr.model.parameters import assign, choice
 from jvr.model.parts import Knob, multiples
+from jvr.model.ranges import AT_LEAST_ONE, Interval
 from jvr.model.scene import Scene
 from jvr.numerics import transformed
 from jvr.types import Affine, Channels, Scalar, Triple
+
+
+def texels() -> Any:
+    """The declaration of the size of a map."""
+    return choice(Interval(low=2.0), doc="rays along each axis of the map")
 
 
 class ShadowVolume(AbstractShadows):
@@ -29,14 +37,10 @@ class ShadowVolume(AbstractShadows):
     and channel of extinction.
     """
 
-    resolution: float = eqx.field(static=True)
+    resolution: float = choice(Interval(0.0, 4.0, "(]"), doc="nodes for each voxel along an axis", hint="1/3 is a good start")
 
     def __init__(self, resolution: float | int = 1 / 3):
-        if not isinstance(resolution, int | float) or not 0 < resolution <= 4:
-            raise ValueError(
-                f"resolution must be above 0 and at most 4 nodes for each voxel, not {resolution!r}; 1/3 is a good start"
-            )
-        self.resolution = float(resolution)
+        assign(self, resolution=resolution)
 
     def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         diagonal = math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape))
@@ -57,13 +61,11 @@ class OpacityShadowMap(AbstractShadows):
     extinction.
     """
 
-    texels: int = eqx.field(static=True)
-    layers: int = eqx.field(static=True)
+    texels: int = texels()
+    layers: int = choice(AT_LEAST_ONE, doc="layers along each ray of the map")
 
     def __init__(self, texels: int = 128, layers: int = 32):
-        check_size(texels, "texels", 2)
-        check_size(layers, "layers", 1)
-        self.texels, self.layers = texels, layers
+        assign(self, texels=texels, layers=layers)
 
     def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
         return depth_visibility(scene, lights, medium, self.texels, self.layers, samples_a_layer(scene, self.layers))
@@ -121,9 +123,3 @@ def depth_visibility(
 def samples_a_layer(scene: Scene, layers: int) -> int:
     """As many samples in a layer of a map as make about one for each voxel of the volume's diagonal."""
     return max(1, round(math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape)) / layers))
-
-
-def check_size(value: int, name: str, least: int) -> None:
-    """**Raises** `ValueError` unless `value` is an integer of at least `least`."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, not {value!r}")

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.fitting.bijectors import AbstractBijector, bijector_of
-from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range, is_by_channel, range_at, within
+from jvr.model.parameters import is_by_channel, parameter, range_at
+from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range
 from jvr.model.scene import Scene
 from jvr.types import Scalar
 
@@ -19,12 +20,12 @@ class ExposedModel(eqx.Module):
     """A scene and the factor between its radiance and the target images' (`None` where they are in the same unit)."""
 
     scene: Scene
-    exposure: Scalar | None = eqx.field(metadata=within(NOT_NEGATIVE))
+    exposure: Scalar | None = parameter(NOT_NEGATIVE, doc="factor between radiance and the images")
 
 
 class Unknowns(eqx.Module):
     """The unknown arrays of a model, by their index in its list of leaves: for each the name that users read, what its class declares
-    (`jvr.model.ranges`) and a bijector."""
+    (`jvr.model.parameters`) and a bijector."""
 
     indices: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
@@ -88,7 +89,7 @@ def choose_unknowns(
     `select` is called on abstract arrays: it may look at structure and shapes, not at values.
 
     Without `transforms` (a tuple, one for each array, `None` where the default is wanted) each array keeps to the range that its class
-    declares (`jvr.model.ranges`): for a solver that keeps `bounds` as the values themselves, else by a smooth map.
+    declares (`jvr.model.parameters`): for a solver that keeps `bounds` as the values themselves, else by a smooth map.
 
     **Raises** `ValueError` where an array is not one of the scene's, not floating point, named twice or outside of its range, or the
     number of transforms differs.

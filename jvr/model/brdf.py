@@ -10,18 +10,22 @@ keeps the colour of the light, as highlights of everything but metals do.
 
 import abc
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jvr.model.checks import float_array, require
 from jvr.model.material import AbstractBRDF, SymmetryAxis
+from jvr.model.parameters import GREY_OR_RGB, assign, parameter
 from jvr.model.phase import AbstractPhase, ScatteringAngle, components
-from jvr.model.ranges import NOT_NEGATIVE, UNIT_INTERVAL, within
+from jvr.model.ranges import NOT_NEGATIVE, UNIT_INTERVAL
 from jvr.numerics import direction_and_length, power_of_cosine
 from jvr.types import ArrayLike, Channels, Scalar, Triple
+
+
+def share(doc: str = "share of the light") -> Any:
+    """The declaration of a fraction that is reflected, grey or linear RGB."""
+    return parameter(UNIT_INTERVAL, shapes=GREY_OR_RGB, doc=doc)
 
 
 class LambertBRDF(AbstractBRDF):
@@ -31,10 +35,10 @@ class LambertBRDF(AbstractBRDF):
     """
 
     symmetry_axis: ClassVar[SymmetryAxis] = "normal"
-    reflectance: Float[Array, "..."] = eqx.field(metadata=within(UNIT_INTERVAL))
+    reflectance: Float[Array, "..."] = share()
 
     def __init__(self, reflectance: ArrayLike = 1.0):
-        self.reflectance = fraction(reflectance, "reflectance", (), (3,))
+        assign(self, reflectance=reflectance)
 
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
         return lambert(self.reflectance, w_i), ()
@@ -49,14 +53,12 @@ class AbstractGlossyBRDF(AbstractBRDF):
     """
 
     symmetry_axis: ClassVar[SymmetryAxis] = "both"
-    diffuse: Float[Array, "..."] = eqx.field(metadata=within(UNIT_INTERVAL))
-    specular: Float[Array, "..."] = eqx.field(metadata=within(UNIT_INTERVAL))
-    exponent: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
+    diffuse: Float[Array, "..."] = share()
+    specular: Float[Array, "..."] = share()
+    exponent: Scalar = parameter(NOT_NEGATIVE, doc="exponent of the highlight", hint="30 is a soft one")
 
     def __init__(self, diffuse: ArrayLike, specular: ArrayLike, exponent: ArrayLike):
-        self.diffuse, self.specular = fraction(diffuse, "diffuse", (), (3,)), fraction(specular, "specular", (), (3,))
-        self.exponent = float_array(exponent, "exponent", ())
-        require(self.exponent, NOT_NEGATIVE.holds, "exponent must be finite and not negative; 30 is a soft highlight")
+        assign(self, diffuse=diffuse, specular=specular, exponent=exponent)
 
     @abc.abstractmethod
     def lobe(self, w_o: Triple, w_i: Triple) -> Float[Array, "..."]:
@@ -111,11 +113,11 @@ class PhaseBRDF(AbstractBRDF):
     """
 
     symmetry_axis: ClassVar[SymmetryAxis] = "eye"
-    phase: AbstractPhase
-    albedo: Float[Array, "..."] = eqx.field(metadata=within(UNIT_INTERVAL))
+    phase: AbstractPhase = parameter(doc="a phase function such as jvr.HenyeyGreenstein(0.5)")
+    albedo: Float[Array, "..."] = share()
 
     def __init__(self, phase: AbstractPhase, albedo: ArrayLike = 1.0):
-        self.phase, self.albedo = phase, fraction(albedo, "albedo", (), (3,))
+        assign(self, phase=phase, albedo=albedo)
 
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
         # Of one shape: a phase function's derivative rules do not broadcast.
@@ -146,10 +148,3 @@ def of_one_shape(w_o: Triple, w_i: Triple) -> tuple[Triple, Triple]:
 def where_or_normal(lit: Bool[Array, "..."], w: Triple) -> Triple:
     """`w` where `lit`, else the normal: there every derivative of what is then left out is finite."""
     return jnp.where(lit, w[0], 0.0), jnp.where(lit, w[1], 0.0), jnp.where(lit, w[2], 1.0)
-
-
-def fraction(value: ArrayLike, name: str, *shapes: tuple[int, ...]) -> Float[Array, "..."]:
-    """A fraction between 0 and 1 as an array of one of the shapes."""
-    array = float_array(value, name, *shapes)
-    require(array, UNIT_INTERVAL.holds, f"{name} must be in [0, 1], a share of the light")
-    return array

@@ -11,8 +11,15 @@ from jaxtyping import Array, Float, Int
 
 from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder, in_double
+from jvr.model.parameters import assign, choice, parameter
+from jvr.model.ranges import ANGLE_OF_VIEW, AT_LEAST_ONE, POSITIVE
 from jvr.numerics import normalise
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector
+
+
+def pixels() -> Any:
+    """The declaration of the size of a picture."""
+    return choice(AT_LEAST_ONE, doc="pixels")
 
 
 class AbstractCamera(eqx.Module):
@@ -61,11 +68,11 @@ class PerspectiveCamera(AbstractCamera):
     **Raises** `ValueError` for sizes below 1 or an angle out of range.
     """
 
-    world_from_camera: Affine
-    fov_y: Scalar
-    width: int = eqx.field(static=True)
-    height: int = eqx.field(static=True)
-    remainder: Remainder
+    world_from_camera: Affine = parameter(doc="rigid transform")
+    fov_y: Scalar = parameter(ANGLE_OF_VIEW, doc="full vertical angle", unit="degrees")
+    width: int = pixels()
+    height: int = pixels()
+    remainder: Remainder = parameter(doc="what single precision leaves of the pose")
 
     def __init__(
         self,
@@ -78,13 +85,7 @@ class PerspectiveCamera(AbstractCamera):
     ):
         self.world_from_camera = affine(world_from_camera, "world_from_camera")
         self.remainder = Remainder.left(world_from_camera, self.world_from_camera, remainder)
-        self.fov_y = float_array(fov_y, "fov_y", ())
-        require(
-            self.fov_y,
-            lambda f: (f > 0) & (f < 180),
-            "fov_y is the full vertical angle in degrees and must lie between 0 and 180",
-        )
-        self.width, self.height = _size(width, height)
+        assign(self, fov_y=fov_y, width=width, height=height)
 
     @classmethod
     def look_at(
@@ -108,11 +109,11 @@ class OrthographicCamera(AbstractCamera):
     **Arguments:** as `PerspectiveCamera`, with `height_world`, the vertical extent of the picture as a world length.
     """
 
-    world_from_camera: Affine
-    height_world: Scalar
-    width: int = eqx.field(static=True)
-    height: int = eqx.field(static=True)
-    remainder: Remainder
+    world_from_camera: Affine = parameter(doc="rigid transform")
+    height_world: Scalar = parameter(POSITIVE, doc="vertical extent of the picture", unit="mm")
+    width: int = pixels()
+    height: int = pixels()
+    remainder: Remainder = parameter(doc="what single precision leaves of the pose")
 
     def __init__(
         self,
@@ -125,9 +126,7 @@ class OrthographicCamera(AbstractCamera):
     ):
         self.world_from_camera = affine(world_from_camera, "world_from_camera")
         self.remainder = Remainder.left(world_from_camera, self.world_from_camera, remainder)
-        self.height_world = float_array(height_world, "height_world", ())
-        require(self.height_world, lambda h: h > 0, "height_world must be a positive world length")
-        self.width, self.height = _size(width, height)
+        assign(self, height_world=height_world, width=width, height=height)
 
     @classmethod
     def look_at(
@@ -218,13 +217,6 @@ def _around(center: ArrayLike, radius: ArrayLike, offsets: list[Any], up: Array,
         upward = jnp.where(jnp.abs(jnp.dot(jnp.asarray(offset), up)) > 0.999, jnp.roll(up, -1), up)
         cameras.append(PerspectiveCamera.look_at(center + radius * in_double(offset), center, upward, fov_y, width, height))
     return tuple(cameras)
-
-
-def _size(width: int, height: int) -> tuple[int, int]:
-    for name, size in (("width", width), ("height", height)):
-        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
-            raise ValueError(f"{name} must be a positive whole number of pixels, not {size!r}")
-    return width, height
 
 
 def _plane(

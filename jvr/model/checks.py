@@ -65,10 +65,10 @@ def colours(value: ArrayLike | Any, name: str, *shapes: tuple[int | None, ...]) 
     return array
 
 
-def radiances(value: ArrayLike | Any, name: str) -> Float[Array, "..."]:
-    """`float_array` of the strength of a light, one number or `(3,)`: finite, not negative, at most `LARGEST_RADIANCE`, and not 8 or 16-bit
-    codes. **Raises** `ValueError` otherwise."""
-    array = float_array(value, name, (), (3,))
+def radiances(value: ArrayLike | Any, name: str, *shapes: tuple[int | None, ...]) -> Float[Array, "..."]:
+    """`float_array` of the strength of a light, by default one number or `(3,)`: finite, not negative, at most `LARGEST_RADIANCE`, and not
+    8 or 16-bit codes. **Raises** `ValueError` otherwise."""
+    array = float_array(value, name, *(shapes or ((), (3,))))
     require(array, NOT_NEGATIVE.holds, f"{name} must be finite and not negative")
     require(array, lambda c: c <= LARGEST_RADIANCE, f"{name} must be at most {LARGEST_RADIANCE:g}: brighter pictures overflow")
     if isinstance(value, np.ndarray) and value.dtype in (np.uint8, np.uint16):

@@ -4,9 +4,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from jvr.model.checks import float_array, require
+from jvr.model.checks import require
 from jvr.model.exact import Exact, Remainder
+from jvr.model.parameters import assign, parameter
 from jvr.model.parts import AbstractPart, PlanEntry
+from jvr.model.ranges import UNLIMITED
 from jvr.types import ArrayLike, Vector
 
 
@@ -18,13 +20,12 @@ class ClippingBox(AbstractPart):
     **Raises** `ValueError` where `lower` is not below `upper` on every axis.
     """
 
-    lower: Vector
-    upper: Vector
-    remainders: tuple[Remainder, Remainder]
+    lower: Vector = parameter(UNLIMITED, doc="x, y, z", unit="mm")
+    upper: Vector = parameter(UNLIMITED, doc="x, y, z", unit="mm")
+    remainders: tuple[Remainder, Remainder] = parameter(doc="what single precision leaves of the corners")
 
     def __init__(self, lower: ArrayLike, upper: ArrayLike, *, remainders: tuple[Remainder, Remainder] | None = None):
-        self.lower = float_array(lower, "ClippingBox lower", (3,))
-        self.upper = float_array(upper, "ClippingBox upper", (3,))
+        assign(self, lower=lower, upper=upper)
         given = remainders or (None, None)
         self.remainders = (Remainder.left(lower, self.lower, given[0]), Remainder.left(upper, self.upper, given[1]))
         require(self.upper - self.lower, lambda d: d > 0, "ClippingBox needs lower < upper on every axis")

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jvr.model.checks import float_array, require
-from jvr.model.ranges import NOT_NEGATIVE, POSITIVE, Interval, within
+from jvr.model.parameters import assign, parameter
+from jvr.model.ranges import NOT_NEGATIVE, POSITIVE, Interval
 from jvr.types import ArrayLike, Scalar, Triple, Vector
 
 Numbers = Float[Array, "..."]
@@ -50,17 +50,12 @@ class Dipole(eqx.Module):
     `eta`: relative index of refraction, in [1, 3]. All differentiable. **Raises** `ValueError` otherwise.
     """
 
-    sigma_s_prime: Vector = eqx.field(metadata=within(POSITIVE))
-    sigma_a: Vector = eqx.field(metadata=within(NOT_NEGATIVE))
-    eta: Scalar = eqx.field(metadata=within(REFRACTION))
+    sigma_s_prime: Vector = parameter(POSITIVE, doc="reduced scattering of red, green, blue", unit="1 / mm")
+    sigma_a: Vector = parameter(NOT_NEGATIVE, doc="absorption of red, green, blue", unit="1 / mm")
+    eta: Scalar = parameter(REFRACTION, doc="index of refraction", hint="skin has 1.3")
 
     def __init__(self, sigma_s_prime: ArrayLike, sigma_a: ArrayLike, eta: ArrayLike = 1.3):
-        self.sigma_s_prime = float_array(sigma_s_prime, "sigma_s_prime", (3,))
-        self.sigma_a, self.eta = float_array(sigma_a, "sigma_a", (3,)), float_array(eta, "eta", ())
-        require(self.sigma_s_prime, POSITIVE.holds, "sigma_s_prime must be finite and positive, in 1 / mm")
-        require(self.sigma_a, NOT_NEGATIVE.holds, "sigma_a must be finite and not negative, in 1 / mm")
-        # The fit of F_dr is for light from the denser side, and reaches 1 at 4.9.
-        require(self.eta, REFRACTION.holds, "eta, an index of refraction, must be in [1, 3]; skin has 1.3")
+        assign(self, sigma_s_prime=sigma_s_prime, sigma_a=sigma_a, eta=eta)
 
     @classmethod
     def preset(cls, name: str) -> "Dipole":

@@ -111,6 +111,10 @@ class AbstractMaterial(AbstractPart):
         """The same as a `jvr.HarmonicMaterial`, of this order unless it has been projected before."""
 
 
+class AbstractBleeding(eqx.Module):
+    """Colour bleeding: what rays of a radiance transfer pick up on their way."""
+
+
 class AbstractRadianceTransfer(AbstractPart):
     """Radiance transfer: how the medium around a point changes the light of the environment that reaches it."""
 

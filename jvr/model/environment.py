@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,8 +12,9 @@ from jaxtyping import Array, Float
 from jvr.model import harmonics
 from jvr.model.checks import float_array, known, radiances, require
 from jvr.model.harmonics.projection import cap
+from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import AbstractPart, PlanEntry, is_zero, spelling
-from jvr.model.ranges import ANY, NOT_NEGATIVE, within
+from jvr.model.ranges import NOT_NEGATIVE
 from jvr.numerics import normalise
 from jvr.pictures import as_radiance
 from jvr.types import ArrayLike
@@ -30,14 +30,12 @@ class EnvironmentLight(AbstractPart):
     Sums of environments are environments: `probe + EnvironmentLight.disc(...)`.
     """
 
-    coefficients: Float[Array, "bands 3"] = eqx.field(metadata=within(ANY, by_channel=True))
-    clamped: bool = eqx.field(static=True)
+    coefficients: Float[Array, "bands 3"] = parameter(by_channel=True, doc="of the harmonics, red, green, blue")
+    clamped: bool = choice(doc="whether negative radiance is cut off")
 
     def __init__(self, coefficients: ArrayLike, *, clamped: bool = True):
-        self.coefficients = float_array(coefficients, "coefficients", (None, 3))
-        require(self.coefficients, np.isfinite, "the coefficients of an environment must be finite")
+        assign(self, coefficients=coefficients, clamped=clamped)
         harmonics.order_of(self.coefficients)
-        self.clamped = bool(clamped)
 
     def title(self, name: str, scene: Any) -> str:
         return f"environment and material {spelling(scene.material)}"

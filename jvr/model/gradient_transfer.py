@@ -3,12 +3,12 @@
 import dataclasses
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jvr.model.checks import colours, float_array, require
-from jvr.model.ranges import EXTINCTION, INCREASING, NOT_NEGATIVE, UNIT_INTERVAL, within
+from jvr.model.checks import require
+from jvr.model.parameters import assign, parameter
+from jvr.model.ranges import COLOUR, EXTINCTION, INCREASING, NOT_NEGATIVE
 from jvr.model.transfer import AbstractTransfer, Classified, any_between
 from jvr.numerics import clamp, larger, smaller
 from jvr.types import ArrayLike, Channels, Scalar
@@ -26,22 +26,13 @@ class GradientTransfer(AbstractTransfer):
 
     takes_gradient: ClassVar[bool] = True
 
-    rgb: Float[Array, "n m 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
-    sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
-    domain: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
-    magnitudes: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
+    rgb: Float[Array, "n m 3"] = parameter(COLOUR, least=2, doc="red, green, blue, linear")
+    sigma_t: Float[Array, "..."] = parameter(EXTINCTION, shapes=(("n", "m"), ("n", "m", 3)), doc="extinction", unit="1 / mm")
+    domain: Float[Array, "2"] = parameter(INCREASING, doc="low < high in the data's own units")
+    magnitudes: Float[Array, "2"] = parameter(INCREASING, doc="low < high, lengths of the gradient", unit="data units per mm")
 
     def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike, magnitudes: ArrayLike):
-        self.rgb = colours(rgb, "rgb", (None, None, 3))
-        n, m, _ = self.rgb.shape
-        if n < 2 or m < 2:
-            raise ValueError(f"a GradientTransfer needs at least 2 x 2 entries, not {n} x {m}")
-        self.sigma_t = float_array(sigma_t, "sigma_t", (n, m), (n, m, 3))
-        require(self.sigma_t, EXTINCTION.holds, "sigma_t must be finite and not negative")
-        self.domain = float_array(domain, "domain", (2,))
-        self.magnitudes = float_array(magnitudes, "magnitudes", (2,))
-        require(self.domain, INCREASING.holds, "domain must be (low, high) with low < high")
-        require(self.magnitudes, INCREASING.holds, "magnitudes must be (low, high) with low < high")
+        assign(self, rgb=rgb, sigma_t=sigma_t, domain=domain, magnitudes=magnitudes)
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         assert magnitude is not None
@@ -71,20 +62,15 @@ class GradientOpacity(AbstractTransfer):
 
     takes_gradient: ClassVar[bool] = True
 
-    transfer: AbstractTransfer
-    low: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
-    high: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
+    transfer: AbstractTransfer = parameter(doc="a transfer function of the scalar")
+    low: Scalar = parameter(NOT_NEGATIVE, doc="length of a gradient", unit="data units per mm")
+    high: Scalar = parameter(NOT_NEGATIVE, doc="length of a gradient", unit="data units per mm")
 
     def __init__(self, transfer: AbstractTransfer, low: ArrayLike, high: ArrayLike):
         if not isinstance(transfer, AbstractTransfer) or transfer.takes_gradient:
             raise TypeError(f"GradientOpacity scales a transfer function of the scalar, not a {type(transfer).__name__}")
-        self.transfer = transfer
-        self.low, self.high = float_array(low, "low", ()), float_array(high, "high", ())
-        require(
-            jnp.stack([self.low, self.high]),
-            lambda v: NOT_NEGATIVE.holds(v) & (v[0] < v[1]),
-            "GradientOpacity needs 0 <= low < high",
-        )
+        assign(self, transfer=transfer, low=low, high=high)
+        require(self.high - self.low, lambda width: width > 0, "GradientOpacity needs 0 <= low < high")
 
     def title(self, name: str, scene: Any) -> str:
         return "gradient opacity"

@@ -16,13 +16,27 @@ from jaxtyping import Array, Float
 
 from jvr.model.checks import float_array, radiances, require
 from jvr.model.exact import Exact, Remainder, in_double
+from jvr.model.parameters import GREY_OR_RGB, assign, declared, parameter
 from jvr.model.parts import AbstractPart, PlanEntry, is_zero
-from jvr.model.ranges import DEGREES, NOT_NEGATIVE, POSITIVE, Entries, UnitVector, within
+from jvr.model.ranges import DEGREES, DIRECTION, NOT_NEGATIVE, POSITIVE, RADIANCE, Entries
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import ArrayLike, Scalar, Triple, Vector
 
-# Of irradiance: constant, linear and quadratic in the distance.
-ATTENUATION = Entries((POSITIVE, NOT_NEGATIVE, NOT_NEGATIVE))
+
+def brightness(doc: str) -> Any:
+    """The declaration of a light's strength, grey or linear RGB."""
+    return parameter(RADIANCE, shapes=GREY_OR_RGB, by_channel=True, doc=doc)
+
+
+def way() -> Any:
+    """The declaration of a light's direction."""
+    return parameter(DIRECTION, doc="x, y, z, the way that the light travels")
+
+
+def falloff() -> Any:
+    """The declaration of how irradiance falls with distance."""
+    terms = Entries((POSITIVE, NOT_NEGATIVE, NOT_NEGATIVE))
+    return parameter(terms, doc="constant, linear, quadratic in the distance")
 
 
 class LightSample(NamedTuple):
@@ -44,8 +58,8 @@ class AbstractEmitter(AbstractPart):
         return (PlanEntry(name, shown, type(self).__name__ + ("" if shown else ": nothing reflects or scatters it")),)
 
     def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
-        strength = next(getattr(self, field) for field in ("irradiance", "intensity", "radiance") if hasattr(self, field))
-        if is_zero(strength):
+        fields = [name for name, f in declared(type(self)).items() if f.metadata["parameter"].within == RADIANCE]
+        if fields and all(is_zero(getattr(self, name)) for name in fields):
             yield f"{self.title(name, scene)} has no strength: it is computed and adds nothing"
         elif not scene.shows_lights:
             yield f"{self.title(name, scene)} is not seen: nothing reflects or scatters it"
@@ -76,12 +90,11 @@ class DirectionalLight(AbstractLight):
     **Arguments:** `direction`: `(3,)`, the way the light travels, of any length but zero; `irradiance`: a number or `(3,)`, not negative.
     """
 
-    direction: Vector = eqx.field(metadata=within(UnitVector()))
-    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
+    direction: Vector = way()
+    irradiance: Float[Array, "..."] = brightness("irradiance")
 
     def __init__(self, direction: ArrayLike, irradiance: ArrayLike = 1.0):
-        self.direction = _direction(direction, "DirectionalLight")
-        self.irradiance = _colour(irradiance, "irradiance")
+        assign(self, direction=direction, irradiance=irradiance)
 
     def sample(self, x: Triple, w_o: Triple) -> LightSample:
         travels, _ = direction_and_length(_three(self.direction))
@@ -100,11 +113,11 @@ class PointLight(AbstractLight):
     `remainder`: of a position that JAX holds already (see `jvr.model.exact`).
     """
 
-    position: Vector
-    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
-    radius: Scalar = eqx.field(metadata=within(POSITIVE))
-    attenuation: Vector | None = eqx.field(metadata=within(ATTENUATION))
-    remainder: Remainder
+    position: Vector = parameter(doc="x, y, z", unit="mm")
+    intensity: Float[Array, "..."] = brightness("power per solid angle")
+    radius: Scalar = parameter(POSITIVE, doc="below which the light grows no brighter", unit="mm", hint="1e-3 is a good start")
+    attenuation: Vector | None = falloff()
+    remainder: Remainder = parameter(doc="what single precision leaves of the position")
 
     def __init__(
         self,
@@ -115,13 +128,8 @@ class PointLight(AbstractLight):
         attenuation: ArrayLike | None = None,
         remainder: Remainder | None = None,
     ):
-        self.position = float_array(position, "position", (3,))
+        assign(self, position=position, intensity=intensity, radius=radius, attenuation=attenuation)
         self.remainder = Remainder.left(position, self.position, remainder)
-        require(self.position, np.isfinite, "a light's position must be finite")
-        self.intensity = _colour(intensity, "intensity")
-        self.radius = float_array(radius, "radius", ())
-        require(self.radius, POSITIVE.holds, "a light's radius must be positive: 1e-3 is a good start")
-        self.attenuation = None if attenuation is None else _attenuation(attenuation)
 
     def sample(self, x: Triple, w_o: Triple) -> LightSample:
         w_i, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
@@ -140,14 +148,14 @@ class SpotLight(AbstractLight):
     `0 <= inner < outer <= 180`.
     """
 
-    position: Vector
-    direction: Vector = eqx.field(metadata=within(UnitVector()))
-    intensity: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
-    inner: Scalar = eqx.field(metadata=within(DEGREES))
-    outer: Scalar = eqx.field(metadata=within(DEGREES))
-    radius: Scalar = eqx.field(metadata=within(POSITIVE))
-    attenuation: Vector | None = eqx.field(metadata=within(ATTENUATION))
-    remainder: Remainder
+    position: Vector = parameter(doc="x, y, z", unit="mm")
+    direction: Vector = way()
+    intensity: Float[Array, "..."] = brightness("power per solid angle")
+    inner: Scalar = parameter(DEGREES, doc="between axis and edge of the cone", unit="degrees")
+    outer: Scalar = parameter(DEGREES, doc="between axis and edge of the cone", unit="degrees")
+    radius: Scalar = parameter(POSITIVE, doc="below which the light grows no brighter", unit="mm", hint="1e-3 is a good start")
+    attenuation: Vector | None = falloff()
+    remainder: Remainder = parameter(doc="what single precision leaves of the position")
 
     def __init__(
         self,
@@ -161,13 +169,10 @@ class SpotLight(AbstractLight):
         attenuation: ArrayLike | None = None,
         remainder: Remainder | None = None,
     ):
-        point = PointLight(position, intensity, radius=radius, attenuation=attenuation, remainder=remainder)
-        self.position, self.intensity, self.remainder = point.position, point.intensity, point.remainder
-        self.radius, self.attenuation = point.radius, point.attenuation
-        self.direction = _direction(direction, "SpotLight")
-        self.inner, self.outer = float_array(inner, "inner", ()), float_array(outer, "outer", ())
-        angles = jnp.stack([self.inner, self.outer])
-        require(angles, lambda a: DEGREES.holds(a) & (a[0] < a[1]), "a SpotLight needs 0 <= inner < outer <= 180 degrees")
+        assign(self, position=position, direction=direction, intensity=intensity)
+        assign(self, inner=inner, outer=outer, radius=radius, attenuation=attenuation)
+        self.remainder = Remainder.left(position, self.position, remainder)
+        require(self.outer - self.inner, lambda width: width > 0, "a SpotLight needs 0 <= inner < outer <= 180 degrees")
 
     def sample(self, x: Triple, w_o: Triple) -> LightSample:
         w_i, distance = direction_and_length(tuple(p - c for p, c in zip(_three(self.position), x, strict=True)))
@@ -190,10 +195,10 @@ class HeadLight(AbstractLight):
 
     casts_shadows: ClassVar[bool] = False
 
-    irradiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
+    irradiance: Float[Array, "..."] = brightness("irradiance")
 
     def __init__(self, irradiance: ArrayLike = 1.0):
-        self.irradiance = _colour(irradiance, "irradiance")
+        assign(self, irradiance=irradiance)
 
     def sample(self, x: Triple, w_o: Triple) -> LightSample:
         return LightSample(w_o, jnp.full_like(x[0], jnp.inf), _rgb(self.irradiance))
@@ -205,10 +210,12 @@ class HeadLight(AbstractLight):
 class AmbientLight(AbstractEmitter):
     """Ambient light: the same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
 
-    radiance: Float[Array, "..."] = eqx.field(metadata=within(NOT_NEGATIVE, by_channel=True))
+    casts_shadows: ClassVar[bool] = False
+
+    radiance: Float[Array, "..."] = brightness("radiance")
 
     def __init__(self, radiance: ArrayLike = 1.0):
-        self.radiance = _colour(radiance, "radiance")
+        assign(self, radiance=radiance)
 
     def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
         yield from super().remarks(name, scene, stats)
@@ -239,7 +246,7 @@ def disc_light(
 ) -> tuple[PointLight, ...]:
     """As `sphere_light`, with places on a disc across `direction`. It shines to both sides."""
     angle, square = jax.random.uniform(key, (2, samples), minval=0.0, maxval=jnp.asarray([[2 * np.pi], [1.0]]))
-    axis, _ = direction_and_length(_three(_direction(direction, "disc_light")))
+    axis, _ = direction_and_length(_three(DirectionalLight(direction).direction))
     u, v = (jnp.stack(side) for side in perpendicular(axis))
     offsets = jnp.sqrt(square)[:, None] * (jnp.cos(angle)[:, None] * u + jnp.sin(angle)[:, None] * v)
     return _spread(position, radius, intensity, offsets)
@@ -250,7 +257,7 @@ def _spread(position: ArrayLike, radius: float, intensity: ArrayLike, offsets: F
         raise ValueError(f"a light's radius must be positive, not {radius!r}; a PointLight has none")
     float_array(position, "position", (3,))
     center, n = in_double(position), offsets.shape[0]
-    return tuple(PointLight(center + radius * in_double(offset), _colour(intensity, "intensity") / n) for offset in offsets)
+    return tuple(PointLight(center + radius * in_double(offset), radiances(intensity, "intensity") / n) for offset in offsets)
 
 
 def perpendicular(axis: Triple) -> tuple[Triple, Triple]:
@@ -273,25 +280,6 @@ def _falloff(distance: Scalar, radius: Scalar, attenuation: Vector | None) -> Sc
         return 1.0 / jnp.square(jnp.maximum(distance, radius))
     constant, linear, quadratic = attenuation
     return 1.0 / (constant + distance * (linear + distance * quadratic))
-
-
-def _attenuation(value: ArrayLike) -> Vector:
-    attenuation = float_array(value, "attenuation", (3,))
-    require(
-        attenuation, ATTENUATION.holds, "attenuation is (constant, linear, quadratic), none negative and the constant positive"
-    )
-    return attenuation
-
-
-def _direction(value: ArrayLike, name: str) -> Vector:
-    direction = float_array(value, "direction", (3,))
-    valid = lambda d: np.all(np.isfinite(d)) & np.any(d != 0)
-    require(direction, valid, f"{name} has no direction: give the way that the light travels, not (0, 0, 0)")
-    return direction
-
-
-def _colour(value: ArrayLike, name: str) -> Float[Array, "..."]:
-    return radiances(value, f"a light's {name}")
 
 
 def _rgb(colour: Float[Array, "..."]) -> Triple:

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.model.checks import float_array, require
 from jvr.model.effects import AbstractMaterial
 from jvr.model.harmonics.basis import basis
-from jvr.model.ranges import INCREASING, NOT_NEGATIVE, within
+from jvr.model.parameters import assign, parameter
+from jvr.model.ranges import INCREASING, NOT_NEGATIVE
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 # The largest angle between the normal and the eye that materials are projected for.
@@ -58,8 +58,12 @@ class HarmonicMaterial(AbstractMaterial):
 
     tinted: Lobe | None
     plain: Lobe | None
-    positions: Float[Array, "classes"] = eqx.field(metadata=within(INCREASING))
-    threshold: Scalar = eqx.field(metadata=within(NOT_NEGATIVE))
+    positions: Float[Array, "classes"] = parameter(INCREASING, doc="of the classes, in the data's own units")
+    threshold: Scalar = parameter(NOT_NEGATIVE, doc="length of a gradient", unit="data units per mm")
+
+    def __init__(self, tinted: Lobe | None, plain: Lobe | None, positions: ArrayLike, threshold: ArrayLike = 0.0):
+        self.tinted, self.plain = tinted, plain
+        assign(self, positions=positions, threshold=threshold)
 
     @classmethod
     def project(
@@ -73,8 +77,7 @@ class HarmonicMaterial(AbstractMaterial):
         """
         if directions < 2 or nodes < 4:
             raise ValueError(f"a material needs at least 2 directions and 4 nodes, not {directions} and {nodes}")
-        limit = float_array(threshold, "threshold", ())
-        require(limit, NOT_NEGATIVE.holds, "threshold must be a length of the gradient, not negative")
+        empty = cls(None, None, np.zeros(1), threshold)
         # The last angle is just above the horizon, where in either precision the eye is above the surface.
         polar = np.array([0.0]) if brdf.symmetry_axis != "both" else np.minimum(np.linspace(0, math.pi / 2, directions), GRAZING)
         w_i, weights = half_sphere_nodes(nodes)
@@ -86,9 +89,9 @@ class HarmonicMaterial(AbstractMaterial):
             summed = lambda v: jnp.asarray(functions * weights[:, None], theta.dtype).T @ jnp.broadcast_to(v, weights.shape)
             return jax.tree.map(summed, values)
 
-        parts = jax.vmap(at)(jnp.asarray(polar, limit.dtype))
+        parts = jax.vmap(at)(jnp.asarray(polar, empty.threshold.dtype))
         tinted, unmodulated = (_lobe(part, order, brdf.symmetry_axis) for part in parts)
-        return cls(tinted, unmodulated, jnp.zeros(1, limit.dtype), limit)
+        return cls(tinted, unmodulated, jnp.zeros(1, empty.threshold.dtype), empty.threshold)
 
     @property
     def order(self) -> int:
@@ -132,17 +135,15 @@ class MaterialByValue(AbstractMaterial):
     `projected` for orders or directions that differ; `TypeError` for anything else, such as another `MaterialByValue`.
     """
 
-    positions: Float[Array, "n"] = eqx.field(metadata=within(INCREASING))
-    materials: tuple[AbstractMaterial, ...]
+    positions: Float[Array, "n"] = parameter(INCREASING, doc="in the data's own units")
+    materials: tuple[AbstractMaterial, ...] = parameter(shapes=(("n",),), doc="BRDFs or jvr.HarmonicMaterials")
 
     def __init__(self, positions: ArrayLike, materials: Sequence[AbstractMaterial]):
-        self.positions = float_array(positions, "positions", (len(materials),))
-        require(self.positions, INCREASING.holds, "positions must be strictly increasing: sort them")
-        self.materials = tuple(materials)
+        assign(self, positions=positions, materials=materials)
         single = [
             isinstance(m, AbstractBRDF) or (isinstance(m, HarmonicMaterial) and m.positions.size == 1) for m in self.materials
         ]
-        if not self.materials or not all(single):
+        if not all(single):
             raise TypeError("materials must be BRDFs or jvr.HarmonicMaterials of one class, one for each position")
 
     @property

@@ -10,14 +10,13 @@ import math
 import os
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jvr.model.brdf import above, of_one_shape, where_or_normal
-from jvr.model.checks import float_array, require
 from jvr.model.material import AbstractBRDF, SymmetryAxis
-from jvr.model.ranges import NOT_NEGATIVE, within
+from jvr.model.parameters import assign, parameter
+from jvr.model.ranges import NOT_NEGATIVE
 from jvr.numerics import direction_and_length, dot
 from jvr.types import ArrayLike, Channels, Triple
 
@@ -35,11 +34,10 @@ class MerlBRDF(AbstractBRDF):
     """
 
     symmetry_axis: ClassVar[SymmetryAxis] = "both"
-    table: Float[Array, "theta_h theta_d phi_d 3"] = eqx.field(metadata=within(NOT_NEGATIVE))
+    table: Float[Array, "theta_h theta_d phi_d 3"] = parameter(NOT_NEGATIVE, doc="measured BRDF", unit="1 / sr")
 
     def __init__(self, table: ArrayLike):
-        self.table = float_array(table, "table", (None, None, None, 3))
-        require(self.table, NOT_NEGATIVE.holds, "a table of reflectance must be finite and not negative")
+        assign(self, table=table)
 
     @classmethod
     def read(cls, path: str | os.PathLike) -> "MerlBRDF":

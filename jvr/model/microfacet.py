@@ -9,17 +9,16 @@ with correlated heights (Heitz 2014, Understanding the masking-shadowing functio
 import math
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.model.brdf import above, fraction, of_one_shape, where_or_normal
-from jvr.model.checks import float_array, require
+from jvr.model.brdf import above, of_one_shape, share, where_or_normal
 from jvr.model.material import AbstractBRDF, SymmetryAxis
+from jvr.model.parameters import assign, parameter
 from jvr.model.phase import components
-from jvr.model.ranges import UNIT_INTERVAL, Interval, within
+from jvr.model.ranges import UNIT_INTERVAL, Interval
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
@@ -46,10 +45,10 @@ class MicrofacetBRDF(AbstractBRDF):
     """
 
     symmetry_axis: ClassVar[SymmetryAxis] = "both"
-    base: Numbers = eqx.field(metadata=within(UNIT_INTERVAL))
-    metallic: Scalar = eqx.field(metadata=within(UNIT_INTERVAL))
-    roughness: Scalar = eqx.field(metadata=within(ROUGHNESS))
-    reflectance_at_normal: Numbers = eqx.field(metadata=within(UNIT_INTERVAL))
+    base: Numbers = share()
+    metallic: Scalar = parameter(UNIT_INTERVAL, doc="from 0 for none to 1 for all")
+    roughness: Scalar = parameter(ROUGHNESS, doc="0.001 is as good as a mirror, 1 is diffuse")
+    reflectance_at_normal: Numbers = share("share of the light straight down")
 
     def __init__(
         self,
@@ -58,10 +57,7 @@ class MicrofacetBRDF(AbstractBRDF):
         roughness: ArrayLike = 0.5,
         reflectance_at_normal: ArrayLike = 0.04,
     ):
-        self.base, self.metallic = fraction(base, "base", (), (3,)), fraction(metallic, "metallic", ())
-        self.reflectance_at_normal = fraction(reflectance_at_normal, "reflectance_at_normal", (), (3,))
-        self.roughness = float_array(roughness, "roughness", ())
-        require(self.roughness, ROUGHNESS.holds, f"roughness must be in {ROUGHNESS}; 0.001 is as good as a mirror")
+        assign(self, base=base, metallic=metallic, roughness=roughness, reflectance_at_normal=reflectance_at_normal)
 
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:
         w_o, w_i = of_one_shape(w_o, w_i)

@@ -3,13 +3,13 @@
 import math
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jvr.model.by_value import ByValue
-from jvr.model.checks import float_array, require
+from jvr.model.checks import require
+from jvr.model.parameters import GREY_OR_RGB, assign, parameter
 from jvr.model.phase import (
     AbstractPhase,
     Numbers,
@@ -22,7 +22,7 @@ from jvr.model.phase import (
     magnitude,
     sample_henyey_greenstein,
 )
-from jvr.model.ranges import ASYMMETRY, INCREASING, NOT_NEGATIVE, Interval, within
+from jvr.model.ranges import INCREASING, NOT_NEGATIVE, Interval
 from jvr.numerics import divide_or_zero, rounded_into
 from jvr.types import ArrayLike, Channels, Scalar
 
@@ -39,12 +39,11 @@ class Draine(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    g: Any = eqx.field(metadata=within(ASYMMETRY))
-    alpha: Numbers = eqx.field(metadata=within(NOT_NEGATIVE))
+    g: Any = asymmetry()
+    alpha: Numbers = parameter(NOT_NEGATIVE, shapes=GREY_OR_RGB, doc="0 for Henyey-Greenstein")
 
     def __init__(self, g: ArrayLike | ByValue, alpha: ArrayLike):
-        self.g, self.alpha = asymmetry(g, "g"), float_array(alpha, "alpha", (), (3,))
-        require(self.alpha, NOT_NEGATIVE.holds, "alpha must be finite and not negative")
+        assign(self, g=g, alpha=alpha)
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return tuple(_draine(g, alpha, angle) for g, alpha in components(self.g, self.alpha))
@@ -65,11 +64,10 @@ class JendersieEon(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    diameter: Numbers = eqx.field(metadata=within(DIAMETER))
+    diameter: Numbers = parameter(DIAMETER, shapes=GREY_OR_RGB, doc="of the droplets", unit="micrometres")
 
     def __init__(self, diameter: ArrayLike):
-        self.diameter = float_array(diameter, "diameter", (), (3,))
-        require(self.diameter, DIAMETER.holds, "diameter of the droplets must be in [5, 50] micrometres")
+        assign(self, diameter=diameter)
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         lobes = (_droplet_lobes(d) for (d,) in components(self.diameter))
@@ -99,22 +97,16 @@ class TabulatedPhase(AbstractPhase):
     in any unit. Differentiable in the values. **Raises** `ValueError` otherwise, and where all values are zero.
     """
 
-    angles: Float[Array, "n"]
-    values: Numbers = eqx.field(metadata=within(NOT_NEGATIVE))
+    angles: Float[Array, "n"] = parameter(INCREASING, least=2, doc="from 0 (forward) to pi (backward)", unit="radians")
+    values: Numbers = parameter(NOT_NEGATIVE, shapes=(("n",), ("n", 3)), doc="in any unit")
 
     def __init__(self, angles: ArrayLike, values: ArrayLike):
-        self.angles = float_array(angles, "angles", (None,))
-        n = self.angles.shape[0]
-        if n < 2:
-            raise ValueError(f"a table needs at least 2 angles, not {n}")
-        require(self.angles, INCREASING.holds, "angles must be strictly increasing: sort them and remove duplicates")
+        assign(self, angles=angles, values=values)
         require(
             self.angles,
             lambda a: (abs(a[0]) < 1e-6) & (abs(a[-1] - math.pi) < 1e-5),
             "angles must run from 0 to pi: convert degrees with numpy.deg2rad, repeat the nearest value where an end is missing",
         )
-        self.values = float_array(values, "values", (n,), (n, 3))
-        require(self.values, NOT_NEGATIVE.holds, "values must be finite and not negative")
         require(jnp.max(self.values, axis=0), lambda v: v > 0, "values must not all be zero")
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:

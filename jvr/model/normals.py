@@ -9,11 +9,11 @@ import abc
 import itertools
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jvr.model.parameters import choice
 from jvr.model.parts import AbstractPart, Knob, PlanEntry, parts_of, spelling
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Nearest, Trilinear, Volume, gradients_at_voxels
@@ -29,7 +29,7 @@ class AbstractNormals(AbstractPart):
     """A gradient estimator. With `of_opacity` it is that of the extinction, after the transfer function (mean of its channels),
     else that of the scalar."""
 
-    of_opacity: bool = eqx.field(static=True, default=False)
+    of_opacity: bool = choice(doc="whether of the extinction, not of the scalar", default=False)
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         asking = " and ".join(other for other, part in parts_of(scene) if part.needs_gradient)

@@ -17,13 +17,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jvr.model.by_value import ByValue
-from jvr.model.checks import float_array, require
-from jvr.model.ranges import ASYMMETRY, NOT_NEGATIVE, UNIT_INTERVAL, within
+from jvr.model.checks import require
+from jvr.model.parameters import GREY_OR_RGB, assign, parameter
+from jvr.model.ranges import ASYMMETRY, NOT_NEGATIVE, UNIT_INTERVAL
 from jvr.numerics import divide_or_zero
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 Numbers: TypeAlias = Float[Array, "..."]
 _UNIFORM = 0.25 / math.pi
+
+
+def asymmetry(doc: str = "-1 backward, 0 even, 1 forward") -> Any:
+    """The declaration of an asymmetry."""
+    return parameter(ASYMMETRY, shapes=GREY_OR_RGB, by_scalar=True, doc=doc)
 
 
 class ScatteringAngle(NamedTuple):
@@ -155,10 +161,10 @@ class HenyeyGreenstein(AbstractPhase):
     **Arguments:** `g`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either; differentiable. **Raises** `ValueError` otherwise.
     """
 
-    g: Any = eqx.field(metadata=within(ASYMMETRY))
+    g: Any = asymmetry("mean cosine: -1 backward, 0 even, 1 forward")
 
     def __init__(self, g: ArrayLike | ByValue):
-        self.g = asymmetry(g, "g")
+        assign(self, g=g)
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return tuple(henyey_greenstein(g, angle) for (g,) in components(self.g))
@@ -178,14 +184,12 @@ class DoubleHenyeyGreenstein(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    g1: Any = eqx.field(metadata=within(ASYMMETRY))
-    g2: Any = eqx.field(metadata=within(ASYMMETRY))
-    weight: Numbers = eqx.field(metadata=within(UNIT_INTERVAL))
+    g1: Any = asymmetry()
+    g2: Any = asymmetry()
+    weight: Numbers = parameter(UNIT_INTERVAL, shapes=GREY_OR_RGB, doc="share of the first lobe")
 
     def __init__(self, g1: ArrayLike | ByValue, g2: ArrayLike | ByValue, weight: ArrayLike):
-        self.g1, self.g2 = asymmetry(g1, "g1"), asymmetry(g2, "g2")
-        self.weight = float_array(weight, "weight", (), (3,))
-        require(self.weight, UNIT_INTERVAL.holds, "weight, of the first lobe, must be in [0, 1]")
+        assign(self, g1=g1, g2=g2, weight=weight)
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return tuple(
@@ -216,10 +220,10 @@ class Schlick(AbstractPhase):
     **Raises** `ValueError` otherwise.
     """
 
-    k: Any = eqx.field(metadata=within(ASYMMETRY))
+    k: Any = asymmetry()
 
     def __init__(self, k: ArrayLike | ByValue):
-        self.k = asymmetry(k, "k")
+        assign(self, k=k)
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
         return tuple(_schlick(k, angle) for (k,) in components(self.k))
@@ -239,16 +243,11 @@ class Mixture(AbstractPhase):
     negative, their sum is positive; differentiable. **Raises** `ValueError` otherwise.
     """
 
-    phases: tuple[AbstractPhase, ...]
-    weights: Numbers = eqx.field(metadata=within(NOT_NEGATIVE))
+    phases: tuple[AbstractPhase, ...] = parameter(shapes=(("m",),), doc="phase functions, at least one")
+    weights: Numbers = parameter(NOT_NEGATIVE, shapes=(("m",), ("m", 3)), doc="weight of a phase function")
 
     def __init__(self, phases: Sequence[AbstractPhase], weights: ArrayLike):
-        self.phases = tuple(phases)
-        m = len(self.phases)
-        if m == 0:
-            raise ValueError("a mixture needs at least one phase function")
-        self.weights = float_array(weights, "weights", (m,), (m, 3))
-        require(self.weights, NOT_NEGATIVE.holds, "weights must be finite and not negative")
+        assign(self, phases=phases, weights=weights)
         require(
             jnp.sum(self.weights, axis=0), lambda total: total > 0, "weights must not all be zero: give one a positive weight"
         )
@@ -283,13 +282,6 @@ class Mixture(AbstractPhase):
             jnp.sum(jnp.stack([fractions[c % len(fractions)][m] * part[c % len(part)] for m, part in enumerate(parts)]), axis=0)
             for c in range(max(len(fractions), *map(len, parts)))
         )
-
-
-def asymmetry(value: ArrayLike | ByValue, name: str) -> Any:
-    """One number or three, or one by value, of magnitude below 1."""
-    array = value.values if isinstance(value, ByValue) else float_array(value, name, (), (3,))
-    require(array, ASYMMETRY.holds, f"{name} must lie between -1 and 1 without either, such as 0.9999")
-    return value if isinstance(value, ByValue) else array
 
 
 def components(*parameters: Numbers) -> tuple[Channels, ...]:

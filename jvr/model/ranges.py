@@ -1,45 +1,92 @@
-"""What a parameter may be and how it acts, declared once beside its field: constructors check its values, and a fit keeps to them."""
+"""The values that a parameter may take: what `jvr.model.parameters` declares, constructors check and a fit keeps to."""
 
 import dataclasses
 import math
 from typing import Any, TypeAlias
 
-import jax
 import numpy as np
 
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """Numbers from `low` to `high`, the ends included unless `is_open`; `per_length`: in units of 1 / world length."""
+    """Numbers from `low` to `high`.
 
-    low: float = -math.inf
-    high: float = math.inf
-    is_open: bool = False
+    - `ends`: which of the two belong to it, in the notation of intervals: "[]", "()", "[)" or "(]".
+    - `per_length`: in units of 1 / world length.
+    - `light`: "colour" or "radiance": constructors take brighter ones than fits make, and no codes (`jvr.model.checks`).
+    - `takes_infinity`: whether values may be infinite.
+    """
+
+    low: float | int = -math.inf
+    high: float | int = math.inf
+    ends: str = "[]"
     per_length: bool = False
+    light: str = ""
+    takes_infinity: bool = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether an end does not belong to it."""
+        return self.ends != "[]"
 
     @property
     def closed(self) -> "Interval":
         """The same with its ends."""
-        return dataclasses.replace(self, is_open=False)
+        return dataclasses.replace(self, ends="[]")
 
     def holds(self, values: Any) -> Any:
-        """Which values are finite and in the interval."""
-        inside = (self.low < values) & (values < self.high) if self.is_open else (self.low <= values) & (values <= self.high)
-        return np.isfinite(values) & inside
+        """Which values are finite (unless it takes infinity) and in the interval."""
+        sound = ~np.isnan(values) if self.takes_infinity else np.isfinite(values)
+        above = self.low < values if self.ends[0] == "(" else self.low <= values
+        below = values < self.high if self.ends[1] == ")" else values <= self.high
+        return sound & above & below
+
+    @property
+    def problem(self) -> str:
+        """What its values must be, as a sentence about others goes on."""
+        return f"must be {self.words}"
+
+    @property
+    def words(self) -> str:
+        bounded = math.isfinite(self.low), math.isfinite(self.high)
+        if all(bounded):
+            low, high = f"{self.low:g}", f"{self.high:g}"
+            forms = {"()": f"between {low} and {high}, without either", "(]": f"above {low} and at most {high}"}
+            return forms.get(self.ends, f"in {self.ends[0]}{low}, {high}{self.ends[1]}")
+        if self.low == 0:
+            return "positive and finite" if self.ends[0] == "(" else "finite and not negative"
+        if any(bounded):
+            return f"finite and {'above' if self.ends[0] == '(' else 'at least'} {self.low:g}"
+        return "a number" if self.takes_infinity else "finite"
+
+    @property
+    def whole_words(self) -> str:
+        """The same of whole numbers."""
+        return f"of at least {self.low:g}" if math.isinf(self.high) else f"from {self.low:g} to {self.high:g}"
 
     def __str__(self) -> str:
         ends = f"{self.low:g} ... {self.high:g}"
-        return f"{ends}, without either end" if self.is_open else ends
+        return f"{ends}, without either end" if self.ends == "()" else ends
 
 
 @dataclasses.dataclass(frozen=True)
 class UnitVector:
     """Directions: their length says nothing."""
 
+    words = "a direction of any length but zero"
+    problem = "must have a direction"
+
+    def holds(self, values: Any) -> Any:
+        """Whether the numbers are finite and one is not zero."""
+        return np.all(np.isfinite(values)) & np.any(values != 0)
+
 
 @dataclasses.dataclass(frozen=True)
 class Increasing:
     """Strictly increasing numbers."""
+
+    words = "strictly increasing"
+    problem = "must be strictly increasing, finite numbers: sort them and remove duplicates"
 
     def holds(self, values: Any) -> Any:
         """Whether the numbers are finite and each is larger than the one before."""
@@ -61,6 +108,14 @@ class Entries:
         """Which entries are finite and in their interval."""
         return np.stack([interval.holds(value) for interval, value in zip(self.intervals, values, strict=True)])
 
+    @property
+    def words(self) -> str:
+        return "; ".join(interval.words for interval in self.intervals)
+
+    @property
+    def problem(self) -> str:
+        return f"must be {self.words}"
+
     def __str__(self) -> str:
         return ", ".join(map(str, self.intervals))
 
@@ -68,42 +123,21 @@ class Entries:
 Range: TypeAlias = Interval | UnitVector | Increasing | Entries
 
 ANY = Interval()
+# Also where nothing ends.
+UNLIMITED = Interval(takes_infinity=True)
 NOT_NEGATIVE = Interval(low=0.0)
-POSITIVE = Interval(low=0.0, is_open=True)
+POSITIVE = Interval(low=0.0, ends="()")
+AT_LEAST_ONE = Interval(low=1.0)
 UNIT_INTERVAL = Interval(0.0, 1.0)
-ASYMMETRY = Interval(-1.0, 1.0, is_open=True)
+FRACTION = Interval(0.0, 1.0, "()")
+ASYMMETRY = Interval(-1.0, 1.0, "()")
 EXTINCTION = Interval(low=0.0, per_length=True)
 DEGREES = Interval(0.0, 180.0)
+ANGLE_OF_VIEW = Interval(0.0, 180.0, "()")
 INCREASING = Increasing()
-
-
-def within(declared: Range, *, by_channel: bool = False) -> dict[str, Any]:
-    """The metadata of a field whose array takes values in a range: `eqx.field(metadata=within(UNIT_INTERVAL))`.
-
-    `by_channel`: where the last axis of the array is colour, each of its channels acts on that channel of a picture alone, as those of
-    light do. A fit then takes one forward derivative for all three.
-    """
-    return {"range": declared, "by_channel": by_channel}
-
-
-def range_at(tree: Any, path: tuple[Any, ...]) -> Range:
-    """The range of the leaf of `tree` at a path of `jax.tree_util`: the innermost that is declared along it, such as that of an
-    asymmetry for the values of a `jvr.ByValue` in its place, and any number where none is."""
-    return _declared_at(tree, path).get("range", ANY)
-
-
-def is_by_channel(tree: Any, path: tuple[Any, ...]) -> bool:
-    """Whether each colour channel of the leaf of `tree` at a path acts on that channel of a picture alone."""
-    return _declared_at(tree, path).get("by_channel", False)
-
-
-def _declared_at(tree: Any, path: tuple[Any, ...]) -> dict[str, Any]:
-    """The metadata of the innermost field along a path that declares a range."""
-    found: dict[str, Any] = {}
-    for key in path:
-        if isinstance(key, jax.tree_util.GetAttrKey):
-            declared = {f.name: dict(f.metadata) for f in dataclasses.fields(tree) if "range" in f.metadata}
-            found, tree = declared.get(key.name, found), getattr(tree, key.name)
-        else:
-            tree = tree[key.key if isinstance(key, jax.tree_util.DictKey) else key.idx]
-    return found
+DIRECTION = UnitVector()
+# A ray or a sum may end below such a transmittance; at 1 it would end before it began.
+TRANSMITTANCE = Interval(0.0, 1.0, "[)")
+# Linear RGB of which 1 is white, and the strength of a light. Constructors take brighter ones than fits make.
+COLOUR = Interval(0.0, 1.0, light="colour")
+RADIANCE = Interval(low=0.0, light="radiance")

@@ -6,15 +6,15 @@ from typing import Any
 
 import equinox as eqx
 
-from jvr.model.checks import colours
 from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer, AbstractScattering, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
 from jvr.model.light import AbstractEmitter, AbstractLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
+from jvr.model.parameters import assign, parameter
 from jvr.model.parts import AbstractPart, PlanEntry, parts_of
-from jvr.model.ranges import UNIT_INTERVAL, within
+from jvr.model.ranges import COLOUR
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
 from jvr.types import ArrayLike, Vector
@@ -46,19 +46,19 @@ class Scene(AbstractPart):
     the other, and for radiance transfer without both.
     """
 
-    volume: Volume
-    transfer: AbstractTransfer
-    background: Vector | None = eqx.field(metadata=within(UNIT_INTERVAL))
-    optical: AbstractOpticalModel
-    clipping: ClippingBox | None
-    lights: tuple[AbstractEmitter, ...]
-    shading: AbstractShading | None
-    shadows: AbstractShadows | None
-    scattering: AbstractScattering | None
-    normals: AbstractNormals
-    environment: EnvironmentLight | None
-    material: AbstractMaterial | None
-    radiance_transfer: AbstractRadianceTransfer | None
+    volume: Volume = parameter(doc="a jvr.Volume, as jvr.read_volume gives it")
+    transfer: AbstractTransfer = parameter(doc="one of jvr's")
+    background: Vector | None = parameter(COLOUR, doc="red, green, blue, linear")
+    optical: AbstractOpticalModel = parameter(doc="one of jvr's")
+    clipping: ClippingBox | None = parameter(doc="a jvr.ClippingBox")
+    lights: tuple[AbstractEmitter, ...] = parameter(doc="a sequence of jvr's lights")
+    shading: AbstractShading | None = parameter(doc="one of jvr's")
+    shadows: AbstractShadows | None = parameter(doc="one of jvr's")
+    scattering: AbstractScattering | None = parameter(doc="one of jvr's")
+    normals: AbstractNormals = parameter(doc="one of jvr's")
+    environment: EnvironmentLight | None = parameter(doc="a jvr.EnvironmentLight")
+    material: AbstractMaterial | None = parameter(doc="one of jvr's")
+    radiance_transfer: AbstractRadianceTransfer | None = parameter(doc="a jvr.RadianceTransfer")
 
     def __init__(
         self,
@@ -77,20 +77,9 @@ class Scene(AbstractPart):
         material: AbstractMaterial | None = None,
         radiance_transfer: AbstractRadianceTransfer | None = None,
     ):
-        self.volume = volume
-        self.transfer = transfer
-        self.background = None if background is None else colours(background, "background", (3,))
-        self.optical = optical
-        self.clipping = clipping
-        self.lights = tuple(lights)
-        self.shading = shading
-        self.shadows = shadows
-        self.scattering = scattering
-        self.normals = normals
-        self.environment = environment
-        self.material = material
-        self.radiance_transfer = radiance_transfer
-        _check_kinds(self)
+        assign(self, volume=volume, transfer=transfer, background=background, optical=optical, clipping=clipping)
+        assign(self, lights=lights, shading=shading, shadows=shadows, scattering=scattering, normals=normals)
+        assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer)
         _check_light(self)
         _check_environment(self)
 
@@ -145,32 +134,6 @@ def material_order(environment: EnvironmentLight, transfer: AbstractRadianceTran
     if transfer is None or not transfer.exact:
         return environment.order
     return max(environment.order, transfer.order)
-
-
-def _check_kinds(scene: Scene) -> None:
-    """Every part is of its kind."""
-    kinds = {
-        "volume": Volume,
-        "transfer": AbstractTransfer,
-        "optical": AbstractOpticalModel,
-        "clipping": ClippingBox,
-        "shading": AbstractShading,
-        "shadows": AbstractShadows,
-        "scattering": AbstractScattering,
-        "normals": AbstractNormals,
-        "environment": EnvironmentLight,
-        "material": AbstractMaterial,
-        "radiance_transfer": AbstractRadianceTransfer,
-    }
-    for name, kind in kinds.items():
-        part = getattr(scene, name)
-        absent = part is None and name not in ("volume", "transfer", "optical")
-        if not absent and not isinstance(part, kind):
-            wanted = "a jvr.Volume, as jvr.read_volume gives it" if name == "volume" else "one of jvr's"
-            raise TypeError(f"{name} must be {wanted}, not {type(part).__name__}")
-    for light in scene.lights:
-        if not isinstance(light, AbstractEmitter):
-            raise TypeError(f"lights must be a sequence of jvr's lights, not of {type(light).__name__}")
 
 
 def _check_light(scene: Scene) -> None:

@@ -6,12 +6,11 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jvr.model.checks import colours, float_array, require
+from jvr.model.parameters import assign, parameter
 from jvr.model.parts import AbstractPart, PlanEntry
-from jvr.model.ranges import EXTINCTION, INCREASING, POSITIVE, UNIT_INTERVAL, within
+from jvr.model.ranges import COLOUR, EXTINCTION, INCREASING, POSITIVE
 from jvr.numerics import clamp, divide_or_zero, read_run
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
@@ -22,6 +21,11 @@ class Classified(NamedTuple):
 
     rgb: Triple
     sigma_t: Channels
+
+
+def extinction() -> Any:
+    """The declaration of an extinction for each entry, grey or coloured."""
+    return parameter(EXTINCTION, shapes=(("n",), ("n", 3)), doc="extinction", unit="1 / mm")
 
 
 class AbstractTransfer(AbstractPart):
@@ -87,18 +91,12 @@ class LinearTransfer(AbstractTable):
     **Raises** `ValueError` for other shapes, positions that do not increase, negative or non-finite values.
     """
 
-    positions: Float[Array, "n"] = eqx.field(metadata=within(INCREASING))
-    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
-    sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
+    positions: Float[Array, "n"] = parameter(INCREASING, least=2, doc="in the data's own units")
+    rgb: Float[Array, "n 3"] = parameter(COLOUR, doc="red, green, blue, linear")
+    sigma_t: Float[Array, "..."] = extinction()
 
     def __init__(self, positions: ArrayLike, rgb: ArrayLike, sigma_t: ArrayLike):
-        self.positions = float_array(positions, "positions", (None,))
-        require(self.positions, np.isfinite, "positions must be finite")
-        n = self.positions.shape[0]
-        if n < 2:
-            raise ValueError(f"a transfer function needs at least 2 positions, not {n}")
-        require(self.positions, INCREASING.holds, "positions must be strictly increasing: sort them and remove duplicates")
-        self.rgb, self.sigma_t = _colour(rgb, n), _extinction(sigma_t, n)
+        assign(self, positions=positions, rgb=rgb, sigma_t=sigma_t)
 
     @property
     def ends(self) -> tuple[Scalar, Scalar]:
@@ -124,18 +122,12 @@ class LutTransfer(AbstractTable):
     differentiable. **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
     """
 
-    rgb: Float[Array, "n 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
-    sigma_t: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
-    domain: Float[Array, "2"] = eqx.field(metadata=within(INCREASING))
+    rgb: Float[Array, "n 3"] = parameter(COLOUR, least=2, doc="red, green, blue, linear")
+    sigma_t: Float[Array, "..."] = extinction()
+    domain: Float[Array, "2"] = parameter(INCREASING, doc="low < high in the data's own units")
 
     def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike):
-        self.rgb = colours(rgb, "rgb", (None, 3))
-        n = self.rgb.shape[0]
-        if n < 2:
-            raise ValueError(f"a transfer function needs at least 2 entries, not {n}")
-        self.sigma_t = _extinction(sigma_t, n)
-        self.domain = float_array(domain, "domain", (2,))
-        require(self.domain, INCREASING.holds, "domain must be (low, high) with low < high")
+        assign(self, rgb=rgb, sigma_t=sigma_t, domain=domain)
 
     @property
     def positions(self) -> Float[Array, "n"]:
@@ -161,24 +153,17 @@ class GaussianTransfer(AbstractTransfer):
     every Gaussian underflows. Where all heights are zero the weights do not depend on them: then the derivative in a height has
     the mean colour instead of its Gaussian's own.
 
-    **Arguments:** `center`, `width`: `(g,)` in the data's units, widths positive; `height`: `(g,)` or `(g, 3)`, per world length;
-    `rgb`: `(g, 3)`. All differentiable. **Raises** `ValueError` for other shapes, widths not positive, negative heights.
+    **Arguments:** `center`, `width`: `(n,)` in the data's units, widths positive; `height`: `(n,)` or `(n, 3)`, per world length;
+    `rgb`: `(n, 3)`. All differentiable. **Raises** `ValueError` for other shapes, widths not positive, negative heights.
     """
 
-    center: Float[Array, "g"]
-    width: Float[Array, "g"] = eqx.field(metadata=within(POSITIVE))
-    height: Float[Array, "..."] = eqx.field(metadata=within(EXTINCTION))
-    rgb: Float[Array, "g 3"] = eqx.field(metadata=within(UNIT_INTERVAL))
+    center: Float[Array, "n"] = parameter(doc="in the data's own units")
+    width: Float[Array, "n"] = parameter(POSITIVE, doc="in the data's own units")
+    height: Float[Array, "..."] = extinction()
+    rgb: Float[Array, "n 3"] = parameter(COLOUR, doc="red, green, blue, linear")
 
     def __init__(self, center: ArrayLike, width: ArrayLike, height: ArrayLike, rgb: ArrayLike):
-        self.center = float_array(center, "center", (None,))
-        g = self.center.shape[0]
-        if g < 1:
-            raise ValueError("GaussianTransfer needs at least one Gaussian")
-        self.width = float_array(width, "width", (g,))
-        require(self.center, np.isfinite, "center must be finite")
-        require(self.width, POSITIVE.holds, "width must be positive")
-        self.height, self.rgb = _extinction(height, g, "height"), _colour(rgb, g)
+        assign(self, center=center, width=width, height=height, rgb=rgb)
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         limit = jnp.finfo(self.center.dtype).max
@@ -219,16 +204,6 @@ def any_between(
     # Entries are counted: a difference of sums of the extinctions themselves would round small ones away.
     before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(visible, dtype=jnp.int32)])
     return before[last.astype(jnp.int32) + 1] > before[first.astype(jnp.int32)]
-
-
-def _colour(rgb: ArrayLike, n: int) -> Float[Array, "n 3"]:
-    return colours(rgb, "rgb", (n, 3))
-
-
-def _extinction(sigma_t: ArrayLike, n: int, name: str = "sigma_t") -> Float[Array, "..."]:
-    sigma_t = float_array(sigma_t, name, (n,), (n, 3))
-    require(sigma_t, EXTINCTION.holds, f"{name} must be finite and not negative")
-    return sigma_t
 
 
 def _columns(table: Float[Array, "..."]) -> tuple[Float[Array, "n"], ...]:

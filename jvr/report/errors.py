@@ -6,7 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jvr.model.ranges import Interval, range_at
+from jvr.model.parameters import range_at
+from jvr.model.ranges import Interval
 from jvr.model.transfer import AbstractTransfer
 
 

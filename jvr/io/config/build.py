@@ -15,14 +15,14 @@ from jvr.io.config.environment import Precompute, environment_parts, fit_scene, 
 from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.light import graded, light_parts
 from jvr.io.config.load import Config, started
-from jvr.io.config.schema.transfer import AnyTransfer, TransferFile
+from jvr.io.config.parts import made
+from jvr.io.config.schema.transfer import TransferFile, TransferTable
 from jvr.io.config.schema.whole import AnySampling, FitTable, RefinementTable, SlicesTable, VolumeTable
 from jvr.io.config.transfers import build_transfer, read_transfer, with_gradient
 from jvr.march.differentiation import Forward, Replay, Rows
 from jvr.march.oracle import BrickRange, Finest, LocalError, OpacityChange
 from jvr.march.quadrature import Midpoint, PreIntegrated
 from jvr.model.camera import AbstractCamera, PerspectiveCamera, fibonacci_sphere
-from jvr.model.clipping import ClippingBox
 from jvr.model.optical import AbsorptionOnly, EmissionAbsorption, EmissionOnly
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTransfer, LutTransfer
@@ -179,10 +179,7 @@ def _read(config: Config, table: VolumeTable, path: str) -> Volume:
 
 def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
     tables = config.tables
-    clipping = None
-    if tables.clipping is not None:
-        with blame(config.where("clipping"), "clipping"):
-            clipping = ClippingBox(tables.clipping.lower, tables.clipping.upper)
+    clipping = None if tables.clipping is None else made(config.where, "clipping", tables.clipping)
     light = light_parts(config, transfer) | environment_parts(config)
     fitted = () if tables.fit is None else tables.fit.unknowns
     if not any(name.startswith("volume.") for name in fitted):
@@ -191,11 +188,9 @@ def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
     return Scene(volume, transfer, **surroundings, **light)
 
 
-def _transfer(config: Config, table: AnyTransfer, volume: Volume, key: str) -> AbstractTransfer:
+def _transfer(config: Config, table: TransferTable, volume: Volume, key: str) -> AbstractTransfer:
     if isinstance(table, TransferFile):
-        found = read_transfer(config.find(table.path, f"{key}.path"))
-        with blame(config.where(key), f"{key}.gradient_opacity"):
-            return with_gradient(found, table)
+        return with_gradient(read_transfer(config.find(table.path, f"{key}.path")), table, config.where(key), key)
     return build_transfer(table, volume, config.where(key), key)
 
 

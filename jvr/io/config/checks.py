@@ -7,6 +7,7 @@ from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
 from jvr.io.config.errors import shown
+from jvr.model.ranges import ANY, DIRECTION, Entries, Increasing, Interval, Range
 
 
 def problem(text: str, key: str | None = None) -> PydanticCustomError:
@@ -14,38 +15,39 @@ def problem(text: str, key: str | None = None) -> PydanticCustomError:
     return PydanticCustomError("problem", "{text}", {"text": text} | ({"key": key} if key else {}))
 
 
-def number(what: str, low: float = -math.inf, high: float = math.inf, *, inner: bool = False) -> BeforeValidator:
-    """A real number from `low` to `high` (between them with `inner`); `what` says what it is and in which unit."""
-    return BeforeValidator(lambda value: _number(value, what, low, high, inner))
+def number(what: str, within: Interval = ANY) -> BeforeValidator:
+    """A real number in an interval; `what` says what it is and in which unit."""
+    return BeforeValidator(lambda value: _number(value, what, within))
 
 
-def numbers(
-    count: int | None, what: str, low: float = -math.inf, high: float = math.inf, *, inner: bool = False
-) -> BeforeValidator:
+def numbers(count: int | None, what: str, within: Range = ANY) -> BeforeValidator:
     """A list of real numbers."""
 
     def check(value: Any) -> list[float]:
         if not isinstance(value, list) or (count is not None and len(value) != count):
             wanted = "a list of" if count is None else f"{count}"
             raise problem(f"must be {wanted} numbers in brackets ({what}), not {shown(value)}")
-        return [_number(v, what, low, high, inner, f"entry {i} ") for i, v in enumerate(value)]
+        each = within.intervals if isinstance(within, Entries) else [within if isinstance(within, Interval) else ANY] * len(value)
+        found = [_number(v, what, each[i], f"entry {i} ") for i, v in enumerate(value)]
+        if within == DIRECTION and not any(found):
+            raise problem(f"{DIRECTION.problem} ({what}), not {shown(value)}")
+        return increasing(found) if isinstance(within, Increasing) else found
 
     return BeforeValidator(check)
 
 
-def whole(what: str, low: int, high: int | None = None) -> BeforeValidator:
-    """A whole number of at least `low` and at most `high`."""
+def whole(what: str, within: Interval) -> BeforeValidator:
+    """A whole number in an interval."""
 
     def check(value: Any) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or value < low or (high is not None and value > high):
-            wanted = f"of at least {low}" if high is None else f"from {low} to {high}"
-            raise problem(f"must be a whole number {wanted} ({what}), not {shown(value)}")
+        if isinstance(value, bool) or not isinstance(value, int) or not within.low <= value <= within.high:
+            raise problem(f"must be a whole number {within.whole_words} ({what}), not {shown(value)}")
         return value
 
     return BeforeValidator(check)
 
 
-def _number(value: Any, what: str, low: float, high: float, inner: bool, entry: str = "") -> float:
+def _number(value: Any, what: str, within: Interval, entry: str = "") -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise problem(f"{entry}must be a plain number ({what}), not {shown(value)}")
     try:
@@ -53,12 +55,10 @@ def _number(value: Any, what: str, low: float, high: float, inner: bool, entry: 
     # A whole number beyond all that float64 holds.
     except OverflowError:
         value = math.inf
-    if not math.isfinite(value):
+    if not (math.isfinite(value) or within.takes_infinity):
         raise problem(f"{entry}must be a finite number ({what}), not {value}")
-    if value < low or (inner and value == low):
-        raise problem(f"{entry}must be {'above' if inner else 'at least'} {low:g} ({what}), not {value:g}")
-    if value > high or (inner and value == high):
-        raise problem(f"{entry}must be {'below' if inner else 'at most'} {high:g} ({what}), not {value:g}")
+    if not within.holds(value):
+        raise problem(f"{entry}{within.problem} ({what}), not {value:g}")
     return value
 
 
@@ -72,20 +72,20 @@ def increasing(value: list[float]) -> list[float]:
     return value
 
 
-def number_or_triple(what: str, low: float = -math.inf, high: float = math.inf, *, inner: bool = False) -> BeforeValidator:
+def number_or_triple(what: str, within: Interval = ANY) -> BeforeValidator:
     """One number, or three for red, green and blue."""
 
     def check(value: Any) -> float | list[float]:
         if not isinstance(value, list):
-            return _number(value, what, low, high, inner)
+            return _number(value, what, within)
         if len(value) != 3:
             raise problem(f"must be one number ({what}) or three for red, green, blue, not {shown(value)}")
-        return [_number(v, what, low, high, inner, f"entry {i} ") for i, v in enumerate(value)]
+        return [_number(v, what, within, f"entry {i} ") for i, v in enumerate(value)]
 
     return BeforeValidator(check)
 
 
-def numbers_or_triples(what: str, low: float = -math.inf, high: float = math.inf) -> BeforeValidator:
+def numbers_or_triples(what: str, within: Interval = ANY) -> BeforeValidator:
     """A list with one number for each entry, or three; pydantic's union would complain about both at once."""
 
     def check(value: Any) -> list[Any]:
@@ -98,7 +98,7 @@ def numbers_or_triples(what: str, low: float = -math.inf, high: float = math.inf
             if isinstance(entry, list) and len(entry) != 3:
                 raise problem(f"entry {i} must be 3 numbers ({what} for red, green, blue), not {shown(entry)}")
             for channel in channels:
-                _number(channel, what, low, high, False, f"entry {i} ")
+                _number(channel, what, within, f"entry {i} ")
         return value
 
     return BeforeValidator(check)

@@ -7,21 +7,20 @@ from typing import Any
 import numpy as np
 
 from jvr.io.config.errors import blame
-from jvr.io.config.light import phase_of
 from jvr.io.config.load import Config
+from jvr.io.config.parts import made
 from jvr.io.config.schema.environment import (
     AnyEnvironment,
-    AnyMaterial,
-    DipoleTable,
     ImageTable,
     MaterialsTable,
+    MaterialTable,
     MerlTable,
-    PhaseMaterialTable,
     RadianceTransferTable,
     RotationTable,
 )
 from jvr.model.effects import AbstractMaterial
 from jvr.model.environment import EnvironmentLight
+from jvr.model.material import AbstractBRDF
 from jvr.model.scene import Scene, material_order
 
 Precompute = Callable[..., Scene]
@@ -31,8 +30,7 @@ def environment_parts(config: Config) -> dict[str, Any]:
     """What a configuration says about environment lighting, as keywords of `jvr.Scene`."""
     tables, parts = config.tables, {}
     if tables.radiance_transfer is not None:
-        with blame(config.where("radiance_transfer"), "radiance_transfer"):
-            parts["radiance_transfer"] = _radiance_transfer(config, tables.radiance_transfer)
+        parts["radiance_transfer"] = made(config.where, "radiance_transfer", tables.radiance_transfer, "frozen")
     if tables.environment:
         several = len(tables.environment) > 1
         keys = [f"environment[{i}]" if several else "environment" for i in range(len(tables.environment))]
@@ -61,7 +59,12 @@ def keeps_radiance_transfer(config: Config) -> bool:
 
 def _shapes_radiance_transfer(table: RadianceTransferTable) -> tuple[str, ...]:
     """Parts of the scene that radiance transfer is computed from."""
-    return ("transfer", "volume", "clipping", *(["material"] if table.bleeding == "material" else []))
+    return (
+        "transfer",
+        "volume",
+        "clipping",
+        *(["material"] if table.bleeding is not None and table.bleeding.kind == "material" else []),
+    )
 
 
 def fit_scene(config: Config, scene: Scene, precompute: Precompute) -> Scene:
@@ -105,7 +108,7 @@ def _rotation(turns: list[RotationTable]) -> np.ndarray:
     return matrix
 
 
-def _material(config: Config, table: AnyMaterial | MaterialsTable, order: int) -> AbstractMaterial:
+def _material(config: Config, table: MaterialTable | MaterialsTable, order: int) -> AbstractMaterial:
     if not isinstance(table, MaterialsTable):
         return _one_material(config, "material", table, order, table.threshold)
     from jvr.model.material import MaterialByValue
@@ -113,57 +116,22 @@ def _material(config: Config, table: AnyMaterial | MaterialsTable, order: int) -
     threshold = table.materials[0].threshold
     parts = [_one_material(config, f"material.materials[{i}]", m, order, threshold) for i, m in enumerate(table.materials)]
     with blame(config.where("material"), "material"):
-        made = MaterialByValue(table.positions, parts)
+        found = MaterialByValue(table.positions, parts)
         # Materials that have no place beside each other say so when they are joined.
-        made.projected(0)
-        return made
+        found.projected(0)
+        return found
 
 
-def _one_material(config: Config, key: str, table: AnyMaterial, order: int, threshold: float | None) -> AbstractMaterial:
+def _one_material(config: Config, key: str, table: MaterialTable, order: int, threshold: float | None) -> AbstractMaterial:
+    brdf = _measured(config, key, table) if isinstance(table, MerlTable) else made(config.where, key, table, "threshold")
+    if threshold is None:
+        return brdf
+    from jvr.model.material import HarmonicMaterial
+
     with blame(config.where(key), key):
-        brdf = _brdf(config, key, table)
-        if threshold is None:
-            return brdf
-        from jvr.model.material import HarmonicMaterial
-
         return HarmonicMaterial.project(brdf, order, threshold=threshold)
 
 
-def _brdf(config: Config, key: str, table: AnyMaterial) -> Any:
-    from jvr.model import brdf
-
-    keywords = {name: value for name, value in table.given().items() if name not in ("threshold", "source")}
-    if isinstance(table, MerlTable):
-        from jvr.model.merl import MerlBRDF
-
-        with blame(config.where(f"{key}.path"), f"{key}.path"):
-            return MerlBRDF.read(config.find(table.path, f"{key}.path", table.source))
-    if isinstance(table, PhaseMaterialTable):
-        with blame(config.where(f"{key}.phase"), f"{key}.phase"):
-            keywords["phase"] = phase_of(config, f"{key}.phase", table.phase)
-        return brdf.PhaseBRDF(**keywords)
-    if table.kind == "microfacet":
-        from jvr.model.microfacet import MicrofacetBRDF
-
-        return MicrofacetBRDF(**keywords)
-    return {"lambert": brdf.LambertBRDF, "phong": brdf.PhongBRDF, "blinn-phong": brdf.BlinnPhongBRDF}[table.kind](**keywords)
-
-
-def _radiance_transfer(config: Config, table: RadianceTransferTable) -> Any:
-    from jvr.effects.radiance_transfer import MaterialBleeding, RadianceTransfer, TransferBleeding
-
-    keywords = table.given()
-    keywords.pop("frozen")
-    if table.bleeding is not None:
-        keywords["bleeding"] = TransferBleeding() if table.bleeding == "transfer" else MaterialBleeding()
-    if table.scattering is not None:
-        key = "radiance_transfer.scattering"
-        with blame(config.where(key), key):
-            keywords["scattering"] = _dipole(table.scattering)
-    return RadianceTransfer(**keywords)
-
-
-def _dipole(table: DipoleTable) -> Any:
-    from jvr.model.dipole import Dipole
-
-    return Dipole(**table.given()) if table.preset is None else Dipole.preset(table.preset)
+def _measured(config: Config, key: str, table: MerlTable) -> AbstractBRDF:
+    with blame(config.where(f"{key}.path"), f"{key}.path"):
+        return table.part(config.find(table.path, f"{key}.path", table.source))

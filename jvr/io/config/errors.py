@@ -56,11 +56,11 @@ def first_complaint(error: ValidationError, data: Any) -> tuple[str, str]:
     if first["type"] == "missing":
         return key, "missing; this key is needed here"
     if first["type"] == "literal_error":
-        return key, _choice(first["input"], context["expected"])
+        return key, unknown_choice(first["input"], _words(context["expected"]))
     if first["type"] == "union_tag_not_found":
         return f"{key}.kind", "missing; it says what this table describes"
     if first["type"] == "union_tag_invalid":
-        return f"{key}.kind", _choice(context["tag"], context["expected_tags"])
+        return f"{key}.kind", unknown_choice(context["tag"], _words(context["expected_tags"]))
     if first["type"] in SENTENCES:
         return key, f"{SENTENCES[first['type']]}, not {shown(first['input'])}"
     return key, first["msg"].removeprefix("Value error, ")
@@ -107,6 +107,11 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _choice(given: Any, expected: str) -> str:
-    known = [word.strip(" '") for word in expected.replace(" or ", ",").split(",")]
+def unknown_choice(given: Any, known: Iterable[str]) -> str:
+    """A word that is none of those known."""
     return f"unknown choice {shown(given).removeprefix('the text ')}; {did_you_mean(str(given), known)}"
+
+
+def _words(expected: str) -> list[str]:
+    """The choices in a sentence of pydantic."""
+    return [word.strip(" '") for word in expected.replace(" or ", ",").split(",")]

@@ -7,34 +7,24 @@ from pydantic import TypeAdapter, ValidationError
 
 from jvr.atomic import replacing
 from jvr.io.config.errors import ConfigError, blame, first_complaint
+from jvr.io.config.parts import made
 from jvr.io.config.schema.transfer import (
-    AnyTransfer,
-    GaussianPart,
-    GaussianTable,
-    GradientTable,
-    LinearTable,
-    LutTable,
-    OfScalar,
     PresetTable,
-    SampledTable,
+    Transfer,
     TransferFile,
     TransferTable,
     WindowTable,
 )
 from jvr.io.config.text import array_text, read_toml
+from jvr.io.kinds import KINDS
 from jvr.model import presets
-from jvr.model.gradient_transfer import GradientOpacity, GradientTransfer
-from jvr.model.transfer import AbstractTransfer, GaussianTransfer, LinearTransfer, LutTransfer
+from jvr.model.gradient_transfer import GradientOpacity
+from jvr.model.parameters import declared
+from jvr.model.transfer import AbstractTransfer, LinearTransfer
 from jvr.model.volume import Volume
 from jvr.model.voxels import typical_range
 
 HEADER = "# A transfer function of jvr: colours are linear RGB, extinction is per world length (mm).\n"
-FIELDS = {
-    LinearTransfer: ("linear", ("positions", "rgb", "sigma_t")),
-    LutTransfer: ("lut", ("domain", "rgb", "sigma_t")),
-    GaussianTransfer: ("gaussian", ("center", "width", "height", "rgb")),
-    GradientTransfer: ("gradient", ("domain", "magnitudes", "rgb", "sigma_t")),
-}
 # Optical depth of an automatic window's brightest value, from the centre of the volume to its farthest corner.
 AUTOMATIC_DEPTH = 30.0
 # A window leaves so many voxels out that lie far beyond all others: a share of all, or a number.
@@ -52,10 +42,10 @@ def write_transfer(path: str | os.PathLike, transfer: AbstractTransfer) -> None:
     if isinstance(transfer, GradientOpacity):
         bounds = (f"{name} = {array_text(np.asarray(getattr(transfer, name)))}" for name in ("low", "high"))
         lines, transfer = [f"gradient_opacity = {{ {', '.join(bounds)} }}\n"], transfer.transfer
-    if type(transfer) not in FIELDS:
+    kind = next((kind for kind, name in KINDS[AbstractTransfer].items() if name == type(transfer).__name__), None)
+    if kind is None:
         raise TypeError(f"{type(transfer).__name__} cannot be written as TOML")
-    kind, names = FIELDS[type(transfer)]
-    lines += [f"{name} = {array_text(np.asarray(getattr(transfer, name)))}\n" for name in names]
+    lines += [f"{name} = {array_text(np.asarray(getattr(transfer, name)))}\n" for name in declared(type(transfer))]
     with replacing(path) as temporary:
         temporary.write_text("".join([HEADER, f'kind = "{kind}"\n', *lines]), encoding="utf-8")
 
@@ -67,44 +57,33 @@ def read_transfer(path: str | os.PathLike) -> AbstractTransfer:
     """
     name, (_, data) = str(path), read_toml(path)
     try:
-        table = TypeAdapter(TransferTable).validate_python(data)
+        table = TypeAdapter(Transfer).validate_python(data)
     except ValidationError as error:
         raise ConfigError(name, *first_complaint(error, data)) from None
     return build_transfer(table, None, name, "")
 
 
-def build_transfer(table: AnyTransfer, volume: Volume | None, where: str, key: str) -> AbstractTransfer:
-    """The transfer function of a table; an automatic window looks at the volume."""
+def build_transfer(table: TransferTable, volume: Volume | None, where: str, key: str) -> AbstractTransfer:
+    """The transfer function of a table; presets and an automatic window look at the volume."""
     if isinstance(table, TransferFile):
         raise ConfigError(where, key, "a transfer file cannot name another file")
     with blame(where, key):
-        if isinstance(table, GradientTable):
-            return GradientTransfer(table.rgb, table.sigma_t, table.domain, table.magnitudes)
-        transfer = _of_scalar(table, volume)
-    with blame(where, f"{key}.gradient_opacity".lstrip(".")):
-        return with_gradient(transfer, table)
+        match table:
+            case PresetTable():
+                found = _preset(table, volume)
+            case WindowTable():
+                found = _window(table, volume)
+            case _:
+                found = made(lambda _: where, key, table, "gradient_opacity")
+    return with_gradient(found, table, where, key)
 
 
-def with_gradient(transfer: AbstractTransfer, table: OfScalar | TransferFile) -> AbstractTransfer:
+def with_gradient(transfer: AbstractTransfer, table: TransferTable, where: str, key: str) -> AbstractTransfer:
     """The transfer function, scaled by the length of the gradient where its table says so."""
-    scaling = table.gradient_opacity
-    return transfer if scaling is None else GradientOpacity(transfer, scaling.low, scaling.high)
-
-
-def _of_scalar(table: OfScalar, volume: Volume | None) -> AbstractTransfer:
-    match table:
-        case LinearTable():
-            return LinearTransfer(table.positions, table.rgb, table.sigma_t)
-        case LutTable():
-            return LutTransfer(table.rgb, table.sigma_t, table.domain)
-        case GaussianTable():
-            return GaussianTransfer(table.center, table.width, table.height, table.rgb)
-        case SampledTable():
-            return _sampled(table)
-        case PresetTable():
-            return _preset(table, volume)
-        case WindowTable():
-            return _window(table, volume)
+    if table.gradient_opacity is None:
+        return transfer
+    with blame(where, f"{key}.gradient_opacity".lstrip(".")):
+        return GradientOpacity(transfer, **table.gradient_opacity.given())
 
 
 def _preset(table: PresetTable, volume: Volume | None) -> AbstractTransfer:
@@ -118,27 +97,6 @@ def _preset(table: PresetTable, volume: Volume | None) -> AbstractTransfer:
         return preset(int(volume.data().max()), sigma_t=LABEL_DEPTH / spacing if table.sigma_t is None else table.sigma_t)
     low, high = contents(volume) if table.range is None else table.range
     return preset(low, high, sigma_t=AUTOMATIC_DEPTH / float(volume.radius) if table.sigma_t is None else table.sigma_t)
-
-
-def _sampled(table: SampledTable) -> LutTransfer:
-    s = np.linspace(table.domain[0], table.domain[1], table.entries)
-    sigma_t = np.zeros_like(s)
-    for part in table.extinction:
-        if isinstance(part, GaussianPart):
-            sigma_t += part.height * np.exp(-0.5 * np.square((s - part.center) / part.width))
-        else:
-            low, high = part.between
-            sigma_t += part.height * np.clip((s - low) / (high - low), 0, 1)
-    return LutTransfer(_blend(s, np.asarray(table.positions), np.asarray(table.rgb)), sigma_t, table.domain)
-
-
-def _blend(s: np.ndarray, positions: np.ndarray, rgb: np.ndarray) -> np.ndarray:
-    """Colours between those at `positions`, by smoothstep, so that they have no kinks."""
-    u = np.interp(s, positions, np.arange(len(positions)))
-    low = np.minimum(u.astype(int), max(len(positions) - 2, 0))
-    fraction = np.clip(u - low, 0, 1)[:, None]
-    fraction = fraction * fraction * (3 - 2 * fraction)
-    return (1 - fraction) * rgb[low] + fraction * rgb[np.minimum(low + 1, len(rgb) - 1)]
 
 
 def _window(table: WindowTable, volume: Volume | None) -> LinearTransfer:

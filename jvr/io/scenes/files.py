@@ -34,8 +34,9 @@ def save_scene(scene: Scene, path: str | os.PathLike) -> None:
     Both files are replaced together, or none is.
 
     **Arguments:** `path`: ends in `.toml`.
-    **Raises** `TypeError` for a part whose class is not jvr's own, and for arrays that are being traced; `ValueError` for another ending,
-    and for a scene that its constructors would refuse, as `equinox.tree_at` can make one; `OSError` where a file cannot be written.
+    **Raises** `TypeError` for a part whose class is neither jvr's own nor registered by `jvr.register`, and for arrays that are being
+    traced; `ValueError` for another ending, and for a scene that its constructors would refuse, as `equinox.tree_at` can make one;
+    `OSError` where a file cannot be written.
     """
     path = _named(path)
     if type(scene) is not Scene:
@@ -58,7 +59,8 @@ def save_scene(scene: Scene, path: str | os.PathLike) -> None:
 def load_scene(path: str | os.PathLike) -> Scene:
     """The scene that `jvr.save_scene` wrote, from the text at `path` and the `.npz` beside it.
 
-    Constructors check what was edited. A file can name nothing but jvr's own classes and run nothing: those of strangers can be read.
+    Constructors check what was edited. A file can name nothing but jvr's own classes and those that you have registered, and
+    run nothing: those of strangers can be read.
 
     **Raises** `ValueError` (`jvr.io.config.ConfigError`), one line with file and key, for whatever is not right: another format or
     version, arrays that are missing or another scene's, unknown kinds and keys, values that are refused, double precision without

@@ -1,6 +1,5 @@
 """What a file may name, and what the fields of a class take: all of it is what the classes declare."""
 
-import importlib
 import inspect
 import types
 import typing
@@ -8,23 +7,11 @@ from typing import Any
 
 import equinox as eqx
 
-from jvr.names import NAMES
+from jvr.io.kinds import PARTS as PARTS
+from jvr.io.kinds import class_named as class_named
 
-# Public classes that a scene is made of, by name. Nothing else is ever imported for a file.
-PARTS = {
-    name: module
-    for module, names in NAMES.items()
-    if module.startswith(("jvr.model.", "jvr.effects."))
-    for name in names
-    if name[0].isupper()
-}
 # How a file says that something is absent which would be there if nothing was said.
 NONE = "None"
-
-
-def class_named(kind: str) -> type:
-    """A public class of `PARTS`."""
-    return getattr(importlib.import_module(PARTS[kind]), kind)
 
 
 def kinds_of(annotation: Any) -> list[str]:

@@ -77,8 +77,8 @@ def _kind(part: Any, key: str) -> str:
     name = type(part).__name__
     if name not in PARTS or class_named(name) is not type(part):
         raise TypeError(
-            f"{key} is a {type(part).__module__}.{name}, none of jvr's own classes, which are all that a scene file can name: "
-            "save the scene with one of jvr's in its place, and put yours back after jvr.load_scene"
+            f"{key} is a {type(part).__module__}.{name}, none of jvr's own classes nor registered, which are all that a scene file can "
+            "name: call jvr.register for it, or save the scene with one of jvr's in its place and put yours back after jvr.load_scene"
         )
     return name
 

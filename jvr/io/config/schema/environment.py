@@ -3,31 +3,27 @@
 A parameter that is left out has the default of its class in jvr.
 """
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, PlainValidator, Tag, model_validator
 
 from jvr.io.config.checks import number, number_or_triple, numbers, problem, whole
-from jvr.io.config.schema.light import Phase
-from jvr.io.config.schema.table import Position, Positions, Steepness, Table, named
+from jvr.io.config.schema.parts import BASES, WRITTEN, PartTable, checked_table, part, table_of
+from jvr.io.config.schema.table import Positions, Steepness, Table, named
+from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
+from jvr.model.material import AbstractBRDF
+from jvr.model.ranges import DEGREES, DIRECTION, NOT_NEGATIVE, POSITIVE, Interval
 
-Radiance = Annotated[Any, number_or_triple("radiance", 0.0)]
-Order = Annotated[int, whole("order of the harmonics", 0, 10)]
-Share = Annotated[Any, number_or_triple("share of the light", 0.0, 1.0)]
-Fraction = Annotated[float, number("from 0 for none to 1 for all", 0.0, 1.0)]
+Radiance = Annotated[Any, number_or_triple("radiance", NOT_NEGATIVE)]
+Order = Annotated[int, whole("order of the harmonics", Interval(0, 10))]
 
 
 class RotationTable(Table):
     """A turn about an axis of the world, counter-clockwise when the axis points to the viewer."""
 
-    axis: Position
+    axis: Annotated[list[float], numbers(3, "x, y, z, such as [0, 0, 1]", DIRECTION)]
     degrees: Annotated[float, number("angle in degrees")]
-
-    @model_validator(mode="after")
-    def _check(self) -> "RotationTable":
-        if not any(self.axis):
-            raise problem("must be a direction, such as [0, 0, 1], not zero", "axis")
-        return self
 
 
 def _one_or_more(value: Any) -> Any:
@@ -50,9 +46,9 @@ class ImageTable(AroundTable):
     kind: Literal["image"]
     path: str
     source: str | None = None
-    scale: Annotated[float, number("factor between the map's radiance and the scene's", 0.0)] = 1.0
+    scale: Annotated[float, number("factor between the map's radiance and the scene's", NOT_NEGATIVE)] = 1.0
     order: Order | None = None
-    window: Annotated[float, number("band from which nothing is left", 0.0, inner=True)] | None = None
+    window: Annotated[float, number("band from which nothing is left", POSITIVE)] | None = None
 
 
 class ConstantTable(AroundTable):
@@ -68,7 +64,7 @@ class RoundTable(AroundTable):
 
     kind: Literal["disc"]
     towards: Annotated[list[float], numbers(3, "x, y, z, from the scene to the light")]
-    half_angle: Annotated[float, number("degrees from the middle to the rim", 0.0, 180.0)]
+    half_angle: Annotated[float, number("degrees from the middle to the rim", DEGREES)]
     radiance: Radiance | None = None
     order: Order | None = None
 
@@ -82,56 +78,27 @@ AnyEnvironment = ImageTable | ConstantTable | RoundTable
 Environments = Annotated[list[Annotated[AnyEnvironment, Field(discriminator="kind")]], BeforeValidator(_environments)]
 
 
-class OneMaterialTable(Table):
+class MaterialTable(PartTable):
     """What all materials have. With a threshold they are projected on harmonics when the file is read."""
 
     threshold: Steepness | None = None
 
 
-class LambertBRDFTable(OneMaterialTable):
-    """`jvr.LambertBRDF`."""
-
-    kind: Literal["lambert"]
-    reflectance: Share | None = None
-
-
-class PhongBRDFTable(OneMaterialTable):
-    """`jvr.PhongBRDF` or `jvr.BlinnPhongBRDF`."""
-
-    kind: Literal["phong", "blinn-phong"]
-    diffuse: Share | None = None
-    specular: Share | None = None
-    exponent: Annotated[float, number("exponent of the highlight", 0.0)] | None = None
-
-
-class MicrofacetTable(OneMaterialTable):
-    """`jvr.MicrofacetBRDF`."""
-
-    kind: Literal["microfacet"]
-    base: Share | None = None
-    metallic: Fraction | None = None
-    roughness: Annotated[float, number("0.001 for a mirror, 1 for matte", 0.001, 1.0)] | None = None
-    reflectance_at_normal: Share | None = None
-
-
-class PhaseMaterialTable(OneMaterialTable):
-    """`jvr.PhaseBRDF`."""
-
-    kind: Literal["phase"]
-    phase: Phase
-    albedo: Share | None = None
-
-
-class MerlTable(OneMaterialTable):
+class MerlTable(MaterialTable):
     """`jvr.MerlBRDF.read`."""
 
-    kind: Literal["merl"]
     path: str
     source: str | None = None
 
+    @staticmethod
+    def part(path: Path) -> Any:
+        from jvr.model.merl import MerlBRDF
 
-AnyMaterial = LambertBRDFTable | PhongBRDFTable | MicrofacetTable | PhaseMaterialTable | MerlTable
-OneMaterial = Annotated[AnyMaterial, Field(discriminator="kind"), BeforeValidator(named)]
+        return MerlBRDF.read(path)
+
+
+BASES[AbstractBRDF], WRITTEN[AbstractBRDF] = MaterialTable, {"merl": MerlTable}
+OneMaterial = Annotated[Any, part(AbstractBRDF)]
 
 
 class MaterialsTable(Table):
@@ -158,50 +125,44 @@ Material = Annotated[
 ]
 
 
-class DipoleTable(Table):
-    """`jvr.Dipole`, or one of its presets."""
+class TranslucentTable(PartTable):
+    """A preset of `jvr.Dipole`."""
 
-    preset: str | None = None
-    sigma_s_prime: (
-        Annotated[list[float], numbers(3, "reduced scattering in 1 / mm, red, green, blue", 0.0, inner=True)] | None
-    ) = None
-    sigma_a: Annotated[list[float], numbers(3, "absorption in 1 / mm, red, green, blue", 0.0)] | None = None
-    eta: Annotated[float, number("index of refraction", 1.0, 3.0)] | None = None
+    preset: str
 
-    @model_validator(mode="after")
-    def _check(self) -> "DipoleTable":
-        self._one_of("preset", "sigma_s_prime")
-        if self.preset is not None and (self.sigma_a is not None or self.eta is not None):
-            raise problem("excludes sigma_a and eta: a preset has its own", "preset")
-        if self.sigma_s_prime is not None and self.sigma_a is None:
-            raise problem("missing; give sigma_a beside sigma_s_prime", "sigma_a")
-        return self
+    @staticmethod
+    def part(preset: str) -> Any:
+        from jvr.model.dipole import Dipole
+
+        return Dipole.preset(preset)
 
 
-def _dipole(value: Any) -> Any:
-    return {"preset": value} if isinstance(value, str) else value
+def _dipole(value: Any) -> PartTable:
+    """A preset of `jvr.Dipole`, by its name or in a table, or its numbers."""
+    value = {"preset": value} if isinstance(value, str) else value
+    if isinstance(value, dict) and "preset" in value:
+        if len(value) > 1:
+            raise problem("excludes all other keys: a preset has its own sigma_s_prime, sigma_a and eta", "preset")
+        return checked_table(TranslucentTable, value)
+    from jvr.model.dipole import Dipole
+
+    return checked_table(table_of(Dipole), value)
 
 
-class RadianceTransferTable(Table):
-    """`jvr.RadianceTransfer`. `frozen`: whether a fit keeps what was computed for its start though its unknowns change it."""
+class RadianceTransferTable(PartTable):
+    """What a radiance transfer takes besides its own keys. `frozen`: whether a fit keeps what was computed for its start though its
+    unknowns change it."""
 
-    order: Order | None = None
-    rays: Annotated[int, whole("rays for each node", 1)] | None = None
-    resolution: Annotated[float, number("nodes for each voxel along an axis", 0.0, 1.0)] | None = None
-    bleeding: Literal["transfer", "material"] | None = None
-    scattering: Annotated[DipoleTable, BeforeValidator(_dipole)] | None = None
-    neighbourhood: Annotated[float, number("radius as a share of the longest side", 0.0, 1.0)] | None = None
-    exact: bool | None = None
-    chromaticity: Order | None = None
-    step: Annotated[float, number("first step in voxels", 0.0, inner=True)] | None = None
-    growth: Annotated[float, number("ratio of a step to the one before", 1.0)] | None = None
-    termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", 0.0, 0.999)] | None = None
-    surface: Annotated[float, number("change of transparency between nodes", 0.0, inner=True)] | None = None
-    memory: Annotated[float, number("bytes", 0.0, inner=True)] | None = None
+    bleeding: Annotated[Any, part(AbstractBleeding)] | None = None
+    scattering: Annotated[Any, PlainValidator(_dipole)] | None = None
     frozen: bool = True
 
     @model_validator(mode="after")
     def _check(self) -> "RadianceTransferTable":
-        if self.chromaticity is not None and self.bleeding is None:
+        if getattr(self, "chromaticity", None) is not None and self.bleeding is None:
             raise problem('is for light with a colour: add bleeding = "transfer" or "material"', "chromaticity")
         return self
+
+
+BASES[AbstractRadianceTransfer] = RadianceTransferTable
+RadianceTransfer = Annotated[Any, part(AbstractRadianceTransfer, "projected")]

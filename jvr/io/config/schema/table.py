@@ -2,10 +2,11 @@
 
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, model_validator
 
 from jvr.io.config.checks import increasing, number, numbers, numbers_or_triples, problem, whole
 from jvr.io.config.errors import did_you_mean, shown
+from jvr.model.ranges import ANGLE_OF_VIEW, NOT_NEGATIVE, POSITIVE, Interval
 
 
 def _no_codes(value: Any) -> Any:
@@ -18,16 +19,16 @@ def _no_codes(value: Any) -> Any:
 
 
 Scalar = Annotated[float, number("in the data's own units")]
-Length = Annotated[float, number("mm", 0.0, inner=True)]
+Length = Annotated[float, number("mm", POSITIVE)]
 Position = Annotated[list[float], numbers(3, "x, y, z in mm")]
-Colour = Annotated[list[float], numbers(3, "red, green, blue, linear", 0.0), BeforeValidator(_no_codes)]
+Colour = Annotated[list[float], numbers(3, "red, green, blue, linear", NOT_NEGATIVE), BeforeValidator(_no_codes)]
 Positions = Annotated[list[float], numbers(None, "in the data's own units"), AfterValidator(increasing)]
 Range = Annotated[list[float], numbers(2, "low, high in the data's own units"), AfterValidator(increasing)]
-Extinctions = Annotated[list[Any], numbers_or_triples("extinction per mm", 0.0)]
-Extinction = Annotated[float, number("extinction per mm", 0.0)]
-Pixels = Annotated[int, whole("pixels", 1, 65_536)]
-Angle = Annotated[float, number("full vertical angle in degrees", 0.0, 180.0, inner=True)]
-Steepness = Annotated[float, number("length of a gradient, data units per mm", 0.0)]
+Extinctions = Annotated[list[Any], numbers_or_triples("extinction per mm", NOT_NEGATIVE)]
+Extinction = Annotated[float, number("extinction per mm", NOT_NEGATIVE)]
+Pixels = Annotated[int, whole("pixels", Interval(1, 65_536))]
+Angle = Annotated[float, number("full vertical angle in degrees", ANGLE_OF_VIEW)]
+Steepness = Annotated[float, number("length of a gradient, data units per mm", NOT_NEGATIVE)]
 
 
 class Table(BaseModel):
@@ -60,24 +61,6 @@ class Table(BaseModel):
         for other in others:
             if len(getattr(self, other)) != count:
                 raise problem(f"has {len(getattr(self, other))} entries, {first} has {count}: give as many", other)
-
-
-class ByValueTable(Table):
-    """`jvr.ByValue`."""
-
-    positions: Annotated[Positions, Field(min_length=1)]
-    values: Annotated[list[float], numbers(None, "one for each position")]
-
-    @model_validator(mode="after")
-    def _check(self) -> "ByValueTable":
-        self._same_length("positions", "values")
-        return self
-
-
-# A constant, to be tagged so in the union, or a table with positions and values.
-CONSTANT = Tag("(constant)")
-ByValue = Annotated[ByValueTable, Tag("(by value)")]
-CONSTANT_OR_BY_VALUE = Discriminator(lambda value: "(by value)" if isinstance(value, dict | ByValueTable) else "(constant)")
 
 
 def named(value: Any) -> Any:

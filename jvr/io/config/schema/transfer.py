@@ -1,67 +1,22 @@
 """Tables of transfer functions."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+import numpy as np
+from pydantic import Field, model_validator
 
-from jvr.io.config.checks import increasing, number, numbers, problem, whole
-from jvr.io.config.schema.table import Colour, Extinction, Extinctions, Positions, Range, Scalar, Steepness, Table
-
-
-class GradientOpacityTable(Table):
-    """`jvr.GradientOpacity`: no extinction where the gradient is `low` or less, all of it from `high` on."""
-
-    low: Steepness
-    high: Steepness
+from jvr.io.config.checks import number, problem, whole
+from jvr.io.config.schema.parts import BASES, WRITTEN, PartTable, only, part
+from jvr.io.config.schema.table import Colour, Extinction, Positions, Range, Scalar, Table
+from jvr.model.gradient_transfer import GradientOpacity
+from jvr.model.ranges import POSITIVE, Interval
+from jvr.model.transfer import AbstractTransfer, LutTransfer
 
 
-class OfScalarTable(Table):
-    """A transfer function of the scalar alone, whose extinction the gradient can scale."""
+class TransferTable(PartTable):
+    """What all transfer functions of the scalar have: the gradient can scale their extinction."""
 
-    gradient_opacity: GradientOpacityTable | None = None
-
-
-class LinearTable(OfScalarTable):
-    """`jvr.LinearTransfer`."""
-
-    kind: Literal["linear"]
-    positions: Annotated[Positions, Field(min_length=2)]
-    rgb: list[Colour]
-    sigma_t: Extinctions
-
-    @model_validator(mode="after")
-    def _check(self) -> "LinearTable":
-        self._same_length("positions", "rgb", "sigma_t")
-        return self
-
-
-class LutTable(OfScalarTable):
-    """`jvr.LutTransfer`."""
-
-    kind: Literal["lut"]
-    domain: Range
-    rgb: Annotated[list[Colour], Field(min_length=2)]
-    sigma_t: Extinctions
-
-    @model_validator(mode="after")
-    def _check(self) -> "LutTable":
-        self._same_length("rgb", "sigma_t")
-        return self
-
-
-class GaussianTable(OfScalarTable):
-    """`jvr.GaussianTransfer`."""
-
-    kind: Literal["gaussian"]
-    center: Annotated[list[float], numbers(None, "in the data's own units"), Field(min_length=1)]
-    width: Annotated[list[float], numbers(None, "in the data's own units", 0.0, inner=True)]
-    height: Extinctions
-    rgb: list[Colour]
-
-    @model_validator(mode="after")
-    def _check(self) -> "GaussianTable":
-        self._same_length("center", "width", "height", "rgb")
-        return self
+    gradient_opacity: Annotated[Any, only(GradientOpacity, "low", "high")] | None = None
 
 
 class GaussianPart(Table):
@@ -69,7 +24,7 @@ class GaussianPart(Table):
 
     kind: Literal["gaussian"]
     center: Scalar
-    width: Annotated[float, number("in the data's own units", 0.0, inner=True)]
+    width: Annotated[float, number("in the data's own units", POSITIVE)]
     height: Extinction
 
 
@@ -84,11 +39,10 @@ class RampPart(Table):
 Part = Annotated[GaussianPart | RampPart, Field(discriminator="kind")]
 
 
-class SampledTable(OfScalarTable):
+class SampledTable(TransferTable):
     """A `jvr.LutTransfer` with extinction summed from parts and colours blended smoothly between a few."""
 
-    kind: Literal["sampled"]
-    entries: Annotated[int, whole("entries of the table", 2, 65_536)]
+    entries: Annotated[int, whole("entries of the table", Interval(2, 65_536))]
     domain: Range
     positions: Positions
     rgb: list[Colour]
@@ -99,34 +53,37 @@ class SampledTable(OfScalarTable):
         self._same_length("positions", "rgb")
         return self
 
+    @staticmethod
+    def part(
+        entries: int, domain: list[float], positions: list[float], rgb: list[Any], extinction: list[GaussianPart | RampPart]
+    ) -> LutTransfer:
+        s = np.linspace(domain[0], domain[1], entries)
+        sigma_t = np.zeros_like(s)
+        for one in extinction:
+            if isinstance(one, GaussianPart):
+                sigma_t += one.height * np.exp(-0.5 * np.square((s - one.center) / one.width))
+            else:
+                low, high = one.between
+                sigma_t += one.height * np.clip((s - low) / (high - low), 0, 1)
+        return LutTransfer(_blend(s, np.asarray(positions), np.asarray(rgb)), sigma_t, domain)
 
-class GradientTable(Table):
-    """`jvr.GradientTransfer`: rows by scalar, columns by length of the gradient."""
 
-    kind: Literal["gradient"]
-    domain: Range
-    magnitudes: Annotated[list[float], numbers(2, "low, high in data units per mm", 0.0), AfterValidator(increasing)]
-    rgb: Annotated[list[list[Colour]], Field(min_length=2)]
-    sigma_t: list[Extinctions]
-
-    @model_validator(mode="after")
-    def _check(self) -> "GradientTable":
-        self._same_length("rgb", "sigma_t")
-        for i, (rgb, sigma_t) in enumerate(zip(self.rgb, self.sigma_t, strict=True)):
-            for name, row in (("rgb", rgb), ("sigma_t", sigma_t)):
-                if len(row) != len(self.rgb[0]):
-                    raise problem(f"has {len(row)} entries, rgb[0] has {len(self.rgb[0])}: give as many", f"{name}[{i}]")
-        return self
+def _blend(s: np.ndarray, positions: np.ndarray, rgb: np.ndarray) -> np.ndarray:
+    """Colours between those at `positions`, by smoothstep, so that they have no kinks."""
+    u = np.interp(s, positions, np.arange(len(positions)))
+    low = np.minimum(u.astype(int), max(len(positions) - 2, 0))
+    fraction = np.clip(u - low, 0, 1)[:, None]
+    fraction = fraction * fraction * (3 - 2 * fraction)
+    return (1 - fraction) * rgb[low] + fraction * rgb[np.minimum(low + 1, len(rgb) - 1)]
 
 
 # Presets that take their range from the volume.
 RELATIVE = ("scan", "mr", "micro_ct")
 
 
-class PresetTable(OfScalarTable):
+class PresetTable(TransferTable):
     """One of `jvr.presets`: for CT in Hounsfield units, or for values whose range is given, or found in the volume."""
 
-    kind: Literal["preset"]
     preset: Literal["ct", "ct_bone", "ct_soft_tissue", "ct_lung", "ct_vessels", "scan", "mr", "micro_ct", "labels"]
     range: Range | None = None
     sigma_t: Extinction | None = None
@@ -140,11 +97,10 @@ class PresetTable(OfScalarTable):
         return self
 
 
-class WindowTable(OfScalarTable):
+class WindowTable(TransferTable):
     """`jvr.presets.window_level`; without window and level they come from the volume's values."""
 
-    kind: Literal["window"]
-    window: Annotated[float, number("width in the data's own units", 0.0, inner=True)] | None = None
+    window: Annotated[float, number("width in the data's own units", POSITIVE)] | None = None
     level: Scalar | None = None
     sigma_t: Extinction | None = None
     rgb: Colour = Field(default=[1.0, 1.0, 1.0])
@@ -156,13 +112,12 @@ class WindowTable(OfScalarTable):
         return self
 
 
-class TransferFile(OfScalarTable):
+class TransferFile(TransferTable):
     """A transfer function in a file of its own, as a fit writes it."""
 
-    kind: Literal["file"]
     path: str
 
 
-OfScalar = LinearTable | LutTable | GaussianTable | SampledTable | PresetTable | WindowTable
-AnyTransfer = OfScalar | GradientTable | TransferFile
-TransferTable = Annotated[AnyTransfer, Field(discriminator="kind")]
+BASES[AbstractTransfer] = TransferTable
+WRITTEN[AbstractTransfer] = {"sampled": SampledTable, "preset": PresetTable, "window": WindowTable, "file": TransferFile}
+Transfer = Annotated[Any, part(AbstractTransfer)]

@@ -6,10 +6,13 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
-from jvr.io.config.schema.environment import Environments, Material, RadianceTransferTable
-from jvr.io.config.schema.light import Lights, Normals, ScatteringTable, Shading, Shadows, casts_shadows
+from jvr.io.config.schema.environment import Environments, Material, RadianceTransfer
+from jvr.io.config.schema.light import Lights, Normals, Scattering, Shading, Shadows, casts_shadows
+from jvr.io.config.schema.parts import only
 from jvr.io.config.schema.table import Angle, Colour, Extinction, Length, Pixels, Position, Range, Scalar, Table, named
-from jvr.io.config.schema.transfer import TransferTable
+from jvr.io.config.schema.transfer import Transfer
+from jvr.model.clipping import ClippingBox
+from jvr.model.ranges import AT_LEAST_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, TRANSMITTANCE, UNIT_INTERVAL, Interval
 
 
 class VolumeTable(Table):
@@ -18,9 +21,9 @@ class VolumeTable(Table):
     path: str | None = None
     builtin: Literal["demo"] | None = None
     source: str | None = None
-    shape: list[Annotated[int, whole("voxels along x, y, z", 1)]] | None = None
+    shape: list[Annotated[int, whole("voxels along x, y, z", AT_LEAST_ONE)]] | None = None
     dtype: str | None = None
-    spacing: Annotated[list[float], numbers(3, "mm along x, y, z", 0.0, inner=True)] | None = None
+    spacing: Annotated[list[float], numbers(3, "mm along x, y, z", POSITIVE)] | None = None
     origin: Position | None = None
     direction: Annotated[list[Position], Field(min_length=3, max_length=3)] | None = None
     slope: Scalar | None = None
@@ -28,8 +31,8 @@ class VolumeTable(Table):
     array: str | None = None
     series: str | None = None
     axes: str | None = None
-    channel: Annotated[int, whole("index of a channel", 0)] | str | None = None
-    time: Annotated[int, whole("index of a point in time", 0)] | None = None
+    channel: Annotated[int, whole("index of a channel", NOT_NEGATIVE)] | str | None = None
+    time: Annotated[int, whole("index of a point in time", NOT_NEGATIVE)] | None = None
     missing: Scalar | Literal[False] | None = None
     nan_value: Scalar | None = None
     interpolation: Literal["trilinear", "nearest"] = "trilinear"
@@ -40,13 +43,6 @@ class VolumeTable(Table):
     def _check(self) -> "VolumeTable":
         self._one_of("path", "builtin")
         return self
-
-
-class ClippingTable(Table):
-    """`jvr.ClippingBox`."""
-
-    lower: Position
-    upper: Position
 
 
 class CameraTable(Table):
@@ -94,10 +90,10 @@ class RigTable(CameraTable):
     """Several cameras around the target: `jvr.fibonacci_sphere` or `jvr.orbit`."""
 
     kind: Literal["fibonacci", "orbit"]
-    count: Annotated[int, whole("cameras", 1, 10_000)]
+    count: Annotated[int, whole("cameras", Interval(1, 10_000))]
     radius: Length | None = None
     fov_y: Angle | None = None
-    half_angle_tangent: Annotated[float, number("tangent of half the vertical angle", 0.0, inner=True)] | None = None
+    half_angle_tangent: Annotated[float, number("tangent of half the vertical angle", POSITIVE)] | None = None
     axis: Position | None = None
 
     @model_validator(mode="after")
@@ -130,7 +126,7 @@ class SlicesTable(Table):
 
     kind: Literal["slices"]
     oracle: Literal["local-error", "opacity-change", "brick-range", "finest"] = "local-error"
-    tolerance: Annotated[float, number("opacity and radiance of one voxel", 0.0, inner=True)] = 0.01
+    tolerance: Annotated[float, number("opacity and radiance of one voxel", POSITIVE)] = 0.01
     levels: Literal[0, 1, 2, 3, 4, 5] = 3
 
 
@@ -138,7 +134,7 @@ class RefinementTable(Table):
     """`jvr.Refinement`."""
 
     kind: Literal["refinement"]
-    tolerance: Annotated[float, number("radiance and opacity, 0 for every ray", 0.0)] = 0.005
+    tolerance: Annotated[float, number("radiance and opacity, 0 for every ray", NOT_NEGATIVE)] = 0.005
     tile: Literal[2, 4, 8, 16, 32, 64] = 8
 
 
@@ -149,12 +145,12 @@ Sampling = Annotated[AnySampling, BeforeValidator(named)]
 class SettingsTable(Table):
     """`jvr.Settings`."""
 
-    step: Annotated[float, number("length of a step in voxels of the smallest spacing", 0.0, inner=True)] = 0.5
-    termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", 0.0, 0.999)] = 1e-4
+    step: Annotated[float, number("length of a step in voxels of the smallest spacing", POSITIVE)] = 0.5
+    termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", TRANSMITTANCE)] = 1e-4
     quadrature: Literal["midpoint", "pre-integrated"] = "midpoint"
     skipping: bool = True
-    negligible: Annotated[float, number("optical depth that a ray may leave out, 0 for none", 0.0, 0.999)] = 0.0
-    tile: Annotated[int, whole("rays at a time", 1)] = 262_144
+    negligible: Annotated[float, number("optical depth that a ray may leave out, 0 for none", TRANSMITTANCE)] = 0.0
+    tile: Annotated[int, whole("rays at a time", AT_LEAST_ONE)] = 262_144
     adjoint: Literal["replay", "forward", "rows"] = "replay"
     sampling: Sampling = UniformTable(kind="uniform")
 
@@ -162,9 +158,9 @@ class SettingsTable(Table):
 class StartTable(Table):
     """The table that a fit starts from: one grey and one extinction for every entry."""
 
-    entries: Annotated[int, whole("entries of the table", 2, 65_536)] = 64
-    grey: Annotated[float, number("linear radiance", 0.0, 1.0)] = 0.5
-    opacity: Annotated[float, number("optical depth of one voxel", 0.0)] | None = None
+    entries: Annotated[int, whole("entries of the table", Interval(2, 65_536))] = 64
+    grey: Annotated[float, number("linear radiance", UNIT_INTERVAL)] = 0.5
+    opacity: Annotated[float, number("optical depth of one voxel", NOT_NEGATIVE)] | None = None
     sigma_t: Extinction | None = None
     domain: Range | None = None
 
@@ -178,9 +174,9 @@ class StartTable(Table):
 class PriorsTable(Table):
     """Strengths of the priors; what is not named is not used."""
 
-    colour_smoothness: Annotated[float, number("strength", 0.0)] | None = None
-    extinction_smoothness: Annotated[float, number("strength", 0.0)] | None = None
-    sparsity: Annotated[float, number("strength", 0.0)] | None = None
+    colour_smoothness: Annotated[float, number("strength", NOT_NEGATIVE)] | None = None
+    extinction_smoothness: Annotated[float, number("strength", NOT_NEGATIVE)] | None = None
+    sparsity: Annotated[float, number("strength", NOT_NEGATIVE)] | None = None
 
 
 def _keep(value: Any) -> Any:
@@ -208,11 +204,11 @@ class FitTable(Table):
     start: StartTable | None = None
     initial: dict[str, Any] = Field(default={})
     solver: Literal["levenberg-marquardt", "gauss-newton", "dogleg", "lbfgsb", "bfgs", "lbfgs", "adam"] = "levenberg-marquardt"
-    max_steps: Annotated[int, whole("steps", 1)] = 100
-    rtol: Annotated[float, number("relative change at which the fit ends", 0.0, 1.0, inner=True)] | None = None
-    learning_rate: Annotated[float, number("of Adam, on the transformed unknowns", 0.0, inner=True)] = 0.05
+    max_steps: Annotated[int, whole("steps", AT_LEAST_ONE)] = 100
+    rtol: Annotated[float, number("relative change at which the fit ends", FRACTION)] | None = None
+    learning_rate: Annotated[float, number("of Adam, on the transformed unknowns", POSITIVE)] = 0.05
     loss: Literal["squared-error", "huber", "absolute-error", "dssim"] = "squared-error"
-    huber_delta: Annotated[float, number("radiance", 0.0, inner=True)] = 0.05
+    huber_delta: Annotated[float, number("radiance", POSITIVE)] = 0.05
     priors: PriorsTable = PriorsTable()
     exposure: bool = False
     keep_samples: Annotated[bool | int, BeforeValidator(_keep)] = True
@@ -229,19 +225,19 @@ class ConfigTable(Table):
     """A whole configuration."""
 
     volume: VolumeTable
-    transfer: TransferTable | None = None
-    truth: TransferTable | None = None
+    transfer: Transfer | None = None
+    truth: Transfer | None = None
     background: Colour | None = None
     optical: Literal["emission-absorption", "emission-only", "absorption-only"] = "emission-absorption"
-    clipping: ClippingTable | None = None
+    clipping: Annotated[Any, only(ClippingBox)] | None = None
     lights: Lights = Field(default=[])
     shading: Shading | None = None
     shadows: Shadows | None = None
-    scattering: ScatteringTable | None = None
+    scattering: Scattering | None = None
     normals: Normals | None = None
     environment: Environments = Field(default=[])
     material: Material | None = None
-    radiance_transfer: RadianceTransferTable | None = None
+    radiance_transfer: RadianceTransfer | None = None
     camera: Cameras = Field(default=[PerspectiveTable(kind="perspective")])
     settings: SettingsTable = SettingsTable()
     fit: FitTable | None = None
