@@ -12,15 +12,12 @@ from jvr.cli.inputs import BadInput, reading
 from jvr.cli.runtime import progress, provenance, start_jax
 from jvr.io.config import Config, build_cameras, build_scene
 from jvr.io.config.build import QUADRATURES
-from jvr.io.config.light import NORMALS
+from jvr.io.kinds import KINDS
 from jvr.model.scene import Scene
 from jvr.rendering.foretelling import turns_of
 from jvr.rendering.measure import Measurement
 from jvr.rendering.settings import Settings
 from jvr.rendering.tune import tune
-
-# Choices that are objects, by the names that a configuration has for them.
-KINDS = {kind: name for names in (QUADRATURES, NORMALS) for name, kind in names.items()}
 
 
 def tune_settings(config: Config, output: Path, error: float | None, seconds: float | None) -> dict[str, Any]:
@@ -103,11 +100,18 @@ def tables_of(choice: dict[str, Any]) -> dict[str, dict[str, Any]]:
     tables: dict[str, dict[str, Any]] = {"settings": {}}
     for name, value in choice.items():
         place, _, key = name.rpartition(".")
-        kind = KINDS.get(type(value))
+        kind = _kind(value)
         # A part that is a choice as a whole is known by its kind.
         key, value = ("kind" if place and kind else key), kind or value
         tables.setdefault(place.replace(" ", "_") or "settings", {})[key] = value
     return tables
+
+
+def _kind(value: Any) -> str | None:
+    """What a configuration calls an object, or `None` for what is none."""
+    named = [(cls.__name__, kind) for kind, cls in QUADRATURES.items()]
+    named += [(name, kind) for family, kinds in KINDS.items() if isinstance(value, family) for kind, name in kinds.items()]
+    return dict(named).get(type(value).__name__)
 
 
 def _toml(value: Any) -> str:
