@@ -156,22 +156,22 @@ def memory() -> dict[str, Any]:
 
 def resident() -> dict[str, Any]:
     """Largest resident memory of a process that draws a 256^3 float32 volume, or takes the gradient in its voxels, on one device and on
-    two, less that of the same with 16^3 voxels (the interpreter and the compiler), in copies of the voxels."""
-    found = {}
+    two, less that of the same with 16^3 voxels (the interpreter and the compiler), in copies of the voxels; and the bytes that a fit
+    takes for each ray."""
+    found: dict[str, Any] = {f"fit_on_{count}_bytes_per_ray": float(_measured("fit_bytes_per_ray", count)) for count in (1, 2)}
     for what in ("picture", "gradient"):
         for count in (1, 2):
-            small, large = (_peak(what, count, n) for n in (16, 256))
+            small, large = (int(_measured("peak", what, count, n)) for n in (16, 256))
             found[f"{what}_on_{count}_bytes"] = large
             found[f"{what}_on_{count}_in_volumes"] = (large - small) / (4 * 256**3)
         found[f"{what}_two_over_one"] = found[f"{what}_on_2_bytes"] / found[f"{what}_on_1_bytes"]
     return found
 
 
-def _peak(what: str, count: int, n: int) -> int:
-    """Bytes that a process holds at most."""
-    program = "from benchmarks.resident import peak; import sys; print(peak(sys.argv[1], int(sys.argv[2]), int(sys.argv[3])))"
-    command = [sys.executable, "-c", program, what, str(count), str(n)]
-    return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+def _measured(function: str, *arguments: str | int) -> str:
+    """What a function of `benchmarks.resident` returns in a process of its own."""
+    program = f"from benchmarks.resident import {function}; print({function}(*{arguments!r}))"
+    return subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
 
 
 def fitting() -> dict[str, Any]:
@@ -184,10 +184,10 @@ def fitting() -> dict[str, Any]:
         return {"skipped": "needs the CT head of the public volumes: set JVR_DATA to their folder"}
     start, cameras, images, settings = protocol.start, protocol.cameras, protocol.images, protocol.settings
     chunk = sum(camera.width * camera.height for camera in cameras)
-    observations = observe(start, cameras, images, None, settings).dealt(chunk)
-    kept = keep_samples(start, observations, settings, chunk, 2**31, clamped=True)
+    observations = observe(start, cameras, images, None, settings, chunk)
+    kept = keep_samples(start, observations, settings, 2**31, clamped=True)
     assert kept is not None
-    through, rays = observed_medium(start, kept[1], kept[0], settings, prepare_in_fit(start, settings, False))
+    through, rays = observed_medium(start, kept[1].tile(0), kept[0], settings, prepare_in_fit(start, settings, False))
     plain = jax.jit(yardsticks.kept_march)
     dt = step_length(start, settings)
     jax.block_until_ready(plain(through, rays, dt))

@@ -13,7 +13,7 @@ from docs import reference
 
 project, author, release = "jvr", "the authors of jvr", jvr.__version__
 root_doc = "README"
-include_patterns = ["README.md", "CHANGELOG.md", "docs/**.md"]
+include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**.md"]
 exclude_patterns = [".*", "build", "jvr", "tests"]
 extensions = ["myst_parser"]
 myst_enable_extensions = ["colon_fence"]
@@ -29,7 +29,7 @@ GUIDE = ("rendering", "light", "environment_lighting", "fitting", "derivatives",
 CONTENTS = {
     "Guide": [f"docs/{name}" for name in GUIDE],
     "Reference": [f"docs/reference/{name}" for name in reference.PARTS],
-    "Project": ["CHANGELOG"],
+    "Project": ["CONTRIBUTING", "CHANGELOG"],
 }
 
 

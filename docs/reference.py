@@ -8,7 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+
 import jvr
+from jvr.io.kinds import KINDS
+from jvr.io.reference import markdown, parameters_of
 from jvr.names import NAMES
 
 # Parts of the package, with the titles of their pages.
@@ -73,10 +77,21 @@ def entry(name: str, thing: Any) -> str:
         return directive("function", name + signature(thing), text_of(thing))
     if issubclass(thing, enum.Enum):
         return directive("class", name, f"{text_of(thing)} One of {', '.join(f'`{value}`' for value in thing.__members__)}.")
-    body = [text_of(thing)]
+    body = [text_of(thing), *(f'In a configuration `kind = "{kind}"`.' for kind in kinds_of(thing)), table_of(thing)]
     for method, kind, function in methods(thing):
         body.append(directive(kind, method + ("" if kind == "property" else signature(function)), text_of(function)))
     return directive("class", name + signature(thing), "\n\n".join(body), ":::::")
+
+
+def table_of(cls: type) -> str:
+    """The parameters that a class declares."""
+    entries = parameters_of(cls) if issubclass(cls, eqx.Module) else ()
+    return markdown(entries) if entries else ""
+
+
+def kinds_of(cls: type) -> list[str]:
+    """What configurations call a class."""
+    return [kind for names in KINDS.values() for kind, name in names.items() if name == cls.__name__]
 
 
 def directive(kind: str, head: str, body: str, fence: str = "::::") -> str:

@@ -24,6 +24,13 @@ from docs import reference
 from jvr import cli
 from jvr.cli.app import app
 from jvr.io.config import build_fit, build_scene, config_from
+from jvr.io.config.schema.parts import BASES, WRITTEN, PartTable, table_of
+from jvr.io.kinds import KINDS, class_named
+from jvr.model.effects import AbstractShading, AbstractShadows
+from jvr.model.light import AbstractEmitter
+from jvr.model.material import AbstractBRDF
+from jvr.model.normals import AbstractNormals
+from jvr.model.phase import AbstractPhase
 from jvr.names import NAMES
 
 PUBLIC = {name for names in NAMES.values() for name in names}
@@ -86,7 +93,8 @@ def desk(tmp_path, monkeypatch):
 
 def pages_with(found: list[pages.Block], *slow: str) -> list:
     """The pages of these blocks; some of them, which take ten seconds, are for slow tests."""
-    return [pytest.param(page, marks=[pytest.mark.slow] if page in slow else []) for page in sorted({b.page for b in found})]
+    found_on = sorted({block.page for block in found} - {"CONTRIBUTING.md"})  # which `test_contributing.py` runs
+    return [pytest.param(page, marks=[pytest.mark.slow] if page in slow else []) for page in found_on]
 
 
 @pytest.mark.filterwarnings("error")
@@ -146,6 +154,31 @@ def test_saved_scenes_are_valid(block, tmp_path):
     assert {name: type(getattr(found, name)).__name__ for name in tables} == {
         name: table["kind"] for name, table in tables.items()
     }
+
+
+FAMILIES = {
+    "[[lights]]": AbstractEmitter,
+    "[shading]": AbstractShading,
+    "[shadows]": AbstractShadows,
+    "[scattering.phase]": AbstractPhase,
+    "[normals]": AbstractNormals,
+    "[material]": AbstractBRDF,
+}
+
+
+@pytest.mark.parametrize("section", FAMILIES)
+def test_the_table_of_a_configuration_has_all_kinds_and_keys(section):
+    family, names, keys, here = FAMILIES[section], set(), set(), False
+    for line in PAGES["docs/files.md"].splitlines():
+        first, *cells = line.strip("|").split(" | ") if line.startswith("|") else [""]
+        here = section in first if first.strip() else here
+        if here and len(cells) == 2 and (kinds := re.findall(r"`([\w-]+)`", cells[0])):
+            names |= set(kinds)
+            keys |= set(re.findall(r"`(\w+)`", cells[1]))
+    written = WRITTEN.get(family, {})
+    tables = [*written.values(), *(table_of(class_named(name), BASES.get(family, PartTable)) for name in KINDS[family].values())]
+    assert names == {*KINDS[family], *written}
+    assert keys - names == {key for table in tables for key in table.model_fields} - {"kind"} - names
 
 
 # --- The reference ---------------------------------------------------------------------------------------------------

@@ -99,8 +99,8 @@ def test_kept_samples_change_nothing_and_report_their_bytes():
 
 
 def test_kept_samples_are_the_samples():
-    problem, observations = _problem(), observe(START, CAMERAS, IMAGES, None, SETTINGS).dealt(720)
-    samples, kept = keep_samples(START, observations, SETTINGS, 720, 2**30, clamped=True)
+    problem, observations = _problem(), observe(START, CAMERAS, IMAGES, None, SETTINGS)
+    samples, kept = keep_samples(START, observations, SETTINGS, 2**30, clamped=True)
     values = problem.unknowns.values_from_unconstrained(problem.unknowns.unconstrained_from_model(problem.model), problem.model)
     direct = normal_equations(problem, values, observations)
     stored = normal_equations(problem.with_samples(samples), values, kept)
@@ -131,19 +131,30 @@ def test_normal_equations_have_the_gradient_of_the_objective(loss, names, x64):
     unknowns = choose_unknowns(model, lambda m: (pick(m.scene), m.exposure))
     unknowns = eqx.tree_at(lambda u: u.bijectors, unknowns, (jvr.Identity(),) * len(unknowns.bijectors))
     problem = Problem(model, unknowns, SETTINGS, loss, (), None)
-    observations = observe(scene, CAMERAS, [0.8 * image for image in IMAGES], None, SETTINGS).dealt(720)
+    observations = observe(scene, CAMERAS, [0.8 * image for image in IMAGES], None, SETTINGS)
     values = unknowns.unconstrained_from_model(model)
     normal = normal_equations(problem, values, observations)
-    tiles = jax.tree.map(lambda x: x[None], observations)
-    objective, gradient = jax.value_and_grad(lambda v: value(problem, v, tiles, jnp.ones(())))(values)
+    objective, gradient = jax.value_and_grad(lambda v: value(problem, v, observations, jnp.ones(())))(values)
     np.testing.assert_allclose(normal.loss, objective, rtol=1e-10)
     np.testing.assert_allclose(2 * normal.vector, gradient, rtol=1e-7, atol=1e-9 * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_rays_that_fill_up_the_last_tile_count_for_nothing(every):
+    """A tile of 100 rays does not divide 720 pixels, and every third of these is one of 240."""
+    observations = observe(TRUTH, CAMERAS, IMAGES, None, SETTINGS, 100)
+    tiles = [observations.tile(i, every) for i in range(observations.tile_count(every))]
+    assert sum(float(tile.weight.sum()) for tile in tiles) == 720 / every
+    targets = [np.asarray(tile.target)[np.asarray(tile.weight) > 0] for tile in tiles]
+    if every == 1:
+        everything = np.concatenate([image.reshape(-1, 3) for image in IMAGES])
+        np.testing.assert_array_equal(np.sort(np.concatenate(targets), axis=0), np.sort(everything, axis=0))
 
 
 @pytest.mark.slow
 def test_chunks_do_not_matter(monkeypatch):
     whole = fit(max_steps=5)
-    monkeypatch.setattr("jvr.fitting.fit.CHUNK", 160)
+    monkeypatch.setattr("jvr.fitting.observations.CHUNK", 160)
     np.testing.assert_allclose(fit(max_steps=5).scene.transfer.rgb, whole.scene.transfer.rgb, atol=2e-3)
 
 
@@ -184,7 +195,7 @@ def test_unknowns_are_told_apart_by_their_place():
     pick = lambda s: {"sigma_t": s.transfer.sigma_t, "more": (s.transfer.domain, s.transfer.rgb)}
     chosen = choose_unknowns(ExposedModel(scene, None), lambda m: pick(m.scene))
     # Dictionaries are flattened in the order of their keys.
-    assert chosen.names == ("scene.transfer.domain", "scene.transfer.rgb", "scene.transfer.sigma_t")
+    assert chosen.names == ("transfer.domain", "transfer.rgb", "transfer.sigma_t")
     assert len(set(chosen.indices)) == 3
     result = fit(scene, unknowns=pick, max_steps=1)
     assert result.unknowns == ("transfer.domain", "transfer.rgb", "transfer.sigma_t")

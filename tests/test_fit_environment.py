@@ -154,7 +154,7 @@ def test_least_squares_of_what_scatters_around_nodes_are_not_differentiated_by_r
     one = eqx.tree_at(scattering, frozen, jvr.Dipole.preset("cream"), is_leaf=lambda x: x is None)
     problem, values = problem_of(one, lambda s: scattering(s).sigma_a)
     cameras = jvr.fibonacci_sphere(one.volume.center, 16.0, 1, 34.0, 8, 8)
-    tiles = jax.tree.map(lambda x: x[None], observe(one, cameras, [np.zeros((8, 8, 3))], None, SETTINGS).dealt(64))
+    tiles = observe(one, cameras, [np.zeros((8, 8, 3))], None, SETTINGS)
     jacobian = jax.eval_shape(jax.jacfwd(lambda v: residuals(problem, v, tiles, jnp.ones(()))), values)
     assert jacobian.shape == (tiles.weight.size * 3, 3)
 
@@ -178,14 +178,13 @@ def both_ways(one, unknowns):
     """The gradient of a fit's objective, by the normal equations and by reverse mode."""
     problem, values = problem_of(one, unknowns)
     cameras, images = views(scene(one.volume, sigma=0.3))
-    observations = observe(one, cameras, images, None, SETTINGS).dealt(128)
+    observations = observe(one, cameras, images, None, SETTINGS, 128)
     total = jnp.asarray(3.0 * observations.size)
     around = light_tangents(problem, values)
-    vectors = [normal_equations(problem, values, tile, around).vector for tile in observations.tiles(128)]
+    vectors = [normal_equations(problem, values, observations, i, around=around).vector for i in range(observations.tile_count())]
     # In unconstrained space every value is itself.
     identity = eqx.tree_at(lambda p: p.unknowns.bijectors, problem, tuple(jvr.Identity() for _ in problem.unknowns.bijectors))
-    tiles = jax.tree.map(lambda x: x.reshape(-1, 128, *x.shape[1:]), observations)
-    gradient = compiled(jax.grad(lambda v: value(identity, v, tiles, total)))(values)
+    gradient = compiled(jax.grad(lambda v: value(identity, v, observations, total)))(values)
     return 2 * sum(np.asarray(v, np.float64) for v in vectors) / float(total), gradient
 
 

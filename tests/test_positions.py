@@ -123,7 +123,7 @@ def test_rays_of_a_fit_keep_their_digits():
         images = [np.zeros((camera.height, camera.width, 3), np.float32)]
         observations = observe(scene, [camera], images, None, SETTINGS)
         prepared = prepare_in_fit(scene, SETTINGS, skips=False)
-        return observed_medium(scene, observations, None, SETTINGS, prepared)[1]
+        return observed_medium(scene, observations.tile(0), None, SETTINGS, prepared)[1]
 
     there, here = inside(UTM), inside((0.0, 0, 0))
     for a, b in zip(jax.tree.leaves(there), jax.tree.leaves(here), strict=True):

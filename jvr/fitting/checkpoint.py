@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jvr.atomic import replacing
-from jvr.fitting.observations import Observations
 from jvr.fitting.problem import Problem
 
+# Of what is digested: with another number no digest is the same, which is what `load` says.
+FORMAT = 2
 # Digests by name.
 Fingerprint = dict[str, str]
 
@@ -26,13 +27,12 @@ class CheckpointError(ValueError):
     """A checkpoint that does not belong to this fit, or cannot be read."""
 
 
-def fingerprint(problem: Problem, observations: Observations, solver: Any) -> Fingerprint:
-    """A digest of each thing that a fit depends on, by its name: a checkpoint is not taken up by another fit."""
+def fingerprint(problem: Problem, given: tuple[Any, Any, Any], solver: Any) -> Fingerprint:
+    """A digest of each thing that a fit depends on, by its name: a checkpoint is not taken up by another fit. `given`: cameras, images and
+    weights."""
     scene = {field.name: getattr(problem.model.scene, field.name) for field in dataclasses.fields(problem.model.scene)}
-    parts = scene | {
-        "cameras": (observations.origin, observations.low, observations.behind, observations.direction),
-        "images": observations.target,
-        "weights": observations.weight,
+    parts = scene | dict(zip(("cameras", "images", "weights"), given, strict=True))
+    parts |= {
         "unknowns": problem.unknowns.names,
         "transforms": problem.unknowns.bijectors,
         "exposure": problem.model.exposure,
@@ -42,7 +42,7 @@ def fingerprint(problem: Problem, observations: Observations, solver: Any) -> Fi
         "kept samples": problem.samples is None,
         "solver": solver,
     }
-    return {name: hashlib.sha256(_canonical(part).encode()).hexdigest()[:16] for name, part in parts.items()}
+    return {name: hashlib.sha256(f"{FORMAT}{_canonical(part)}".encode()).hexdigest()[:16] for name, part in parts.items()}
 
 
 def _canonical(value: Any, around: tuple[int, ...] = ()) -> str:

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jvr.execution.devices import on_devices
+from jvr.execution.devices import everywhere, shares
 from jvr.fitting.identifiability import Identifiability, identifiability
 from jvr.fitting.losses import DSSIM, SquaredError
 from jvr.fitting.normal_equations import Normal, light_tangents, normal_equations, prior_expansion
@@ -66,21 +66,18 @@ class ResidualFunction(eqx.Module):
 class Evaluator:
     """A problem and its observations, ready for a solver; everything that is large lives here once."""
 
-    def __init__(self, problem: Problem, observations: Observations, chunk: int, cameras: Sequence[AbstractCamera], images: Any):
+    def __init__(self, problem: Problem, observations: Observations, cameras: Sequence[AbstractCamera], images: Any):
         self.problem = problem
-        self.chunk = chunk
-        self.rays = observations.size
-        self.total = _total(observations)
-        self.levels = _levels(problem, observations, chunk)
-        self.tiles = jax.tree.map(lambda x: on_devices(x.reshape(-1, chunk, *x.shape[1:])), observations)
-        self.functions = self._functions(tuple(cameras), tuple(jnp.asarray(image) for image in images))
+        self.observations = observations
+        # A level takes every so-manieth ray.
+        self.levels = _levels(problem, observations)
+        self.sums = tuple(_sums(observations, every) for every in self.levels)
+        self.functions = self._functions(cameras, images)
 
     def expand(self, level: int, unconstrained: Float[Array, "unknowns"]) -> tuple[float, Normal]:
         """The objective at `unconstrained`, over the rays of a level, and the normal equations in the unknowns' own values."""
         values = self.problem.unknowns.values_from_unconstrained(jnp.asarray(unconstrained), self.problem.model)
-        observations = self.levels[level]
-        normal = self._sum(values, observations)
-        total = _total(observations)
+        normal, total = self._sum(values, self.levels[level]), self.sums[level].residuals
         prior, _, _ = prior_expansion(self.problem, values) if self.problem.priors else (0.0, None, None)
         # Per residual, so that levels with different numbers of rays have the same scale.
         normal = jax.tree.map(lambda x: x / total, normal)
@@ -105,9 +102,8 @@ class Evaluator:
 
     def _rounding(self) -> float:
         """The mean squared error of pictures that differ by the rounding of sums along rays alone."""
-        targets, weight = self.levels[-1].target, self.levels[-1].weight
-        mean = float(jnp.sum(weight[:, None] * jnp.square(targets))) / self.total
-        return (ROUNDING * float(jnp.finfo(targets.dtype).eps)) ** 2 * mean
+        sums = self.sums[-1]
+        return (ROUNDING * float(jnp.finfo(self.observations.target.dtype).eps)) ** 2 * sums.squares / sums.residuals
 
     def identifiability(self, values: Float[Array, "unknowns"]) -> Identifiability:
         """Standard errors at the solution, over all rays."""
@@ -115,10 +111,9 @@ class Evaluator:
         if isinstance(problem.loss, DSSIM):
             # A loss over whole images has no residual variance: the errors are those that its solution has as least squares.
             problem = problem.least_squares()
-        normal = self._sum(values, self.levels[-1], problem)
+        normal = self._sum(values, 1, problem)
         matrix = normal.matrix + self._gauge(values, np.diag(normal.matrix))
-        measurements = 3 * int(jnp.sum(self.levels[-1].weight > 0))
-        return identifiability(matrix, float(normal.squares), measurements, float(jnp.finfo(values.dtype).eps))
+        return identifiability(matrix, float(normal.squares), self.sums[-1].measurements, float(jnp.finfo(values.dtype).eps))
 
     def _gauge(self, values: Float[Array, "unknowns"], diagonal: np.ndarray) -> np.ndarray:
         """What fixes the length of directions: it is 1 by convention, and no image says anything about it."""
@@ -139,38 +134,61 @@ class Evaluator:
         elif isinstance(self.problem.loss, SquaredError) and not self.problem.priors:
             mean = loss
         else:
-            mean = float(
-                _mean_squares(self.problem.least_squares(), jnp.asarray(unconstrained), self.tiles, jnp.asarray(self.total))
-            )
+            total = jnp.asarray(self.sums[-1].residuals)
+            mean = float(_mean_squares(self.problem.least_squares(), jnp.asarray(unconstrained), self.observations, total))
         return float(-10 * np.log10(max(mean, 1e-20)))
 
-    def _sum(self, values: Float[Array, "unknowns"], observations: Observations, problem: Problem | None = None) -> Normal:
-        """The normal equations of all chunks together, in float64."""
-        problem = problem or self.problem
+    def fraction(self, level: int) -> float:
+        """Of all rays, how many a level takes."""
+        every = self.levels[level]
+        return self.observations.tile_count(every) / self.observations.tile_count()
+
+    def _sum(self, values: Float[Array, "unknowns"], every: int, problem: Problem | None = None) -> Normal:
+        """The normal equations of every `every`-th ray, all chunks together, in float64."""
+        problem, observations = problem or self.problem, self.observations
         around = light_tangents(problem, values)
-        parts = [normal_equations(problem, values, tile, around) for tile in observations.tiles(self.chunk)]
+        tiles = range(observations.tile_count(every))
+        parts = [normal_equations(problem, values, observations, i, every, around) for i in tiles]
         return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
 
-    def _functions(self, cameras: tuple[AbstractCamera, ...], images: tuple[Array, ...]) -> Functions:
+    def _functions(self, cameras: Sequence[AbstractCamera], images: Any) -> Functions:
+        total = jnp.asarray(self.sums[-1].residuals)
         if isinstance(self.problem.loss, DSSIM):
-            function = ImageValueFunction(self.problem, cameras, images)
+            function = ImageValueFunction(self.problem, tuple(cameras), tuple(jnp.asarray(image) for image in images))
         else:
-            function = ValueFunction(self.problem, self.tiles, jnp.asarray(self.total))
-        residuals = ResidualFunction(self.problem, self.tiles, jnp.asarray(self.total))
+            function = ValueFunction(self.problem, self.observations, total)
+        residuals = ResidualFunction(self.problem, self.observations, total)
         levels = tuple(functools.partial(self.expand, i) for i in range(len(self.levels)))
         return Functions(function, residuals, levels, self.limits, self.quadratic, self._rounding())
 
 
-def _total(observations: Observations) -> float:
-    """Weighted number of residuals."""
-    return max(3 * float(jnp.sum(observations.weight)), float(np.finfo(np.float32).tiny))
+class Sums(NamedTuple):
+    """Over the rays of a level: `residuals`, their weighted number; `squares` of the targets, weighted; how many `measurements` count."""
+
+    residuals: float
+    squares: float
+    measurements: int
 
 
-def _levels(problem: Problem, observations: Observations, chunk: int) -> tuple[Observations, ...]:
-    """All observations, after a subset that still over-determines the unknowns where that is much smaller."""
+def _sums(observations: Observations, every: int) -> Sums:
+    weight, squares, counted = _weights(observations, every)
+    return Sums(max(3 * float(weight), float(np.finfo(np.float32).tiny)), float(squares), 3 * int(counted))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _weights(observations: Observations, every: int) -> tuple[Array, Array, Array]:
+    each = observations.size // shares()
+    taken = (jnp.arange(observations.size) % each % every == 0).reshape(observations.weight.shape)
+    weight = jnp.where(taken, observations.weight, 0)
+    squares = jnp.sum(weight[..., None] * jnp.square(observations.target))
+    return everywhere((jnp.sum(weight), squares, jnp.sum(weight > 0)))
+
+
+def _levels(problem: Problem, observations: Observations) -> tuple[int, ...]:
+    """All rays, after a subset that still over-determines the unknowns where that is much smaller."""
     unknowns = sum(v.size for v in problem.unknowns.values(problem.model))
-    every = min(MOST_THINNING, 3 * observations.size // max(LEAST_RESIDUALS * unknowns, chunk))
-    return (observations,) if every < 2 else (observations.subsampled(every, chunk), observations)
+    every = min(MOST_THINNING, 3 * observations.size // max(LEAST_RESIDUALS * unknowns, observations.chunk))
+    return (1,) if every < 2 else (every, 1)
 
 
 _mean_squares = eqx.filter_jit(value)

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from jvr.execution.devices import shares
 from jvr.fitting import checkpoint as checkpoints
 from jvr.fitting.evaluator import Evaluator
 from jvr.fitting.identifiability import Identifiability, undetermined
@@ -34,8 +33,6 @@ from jvr.rendering.measure import similarity
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
 
-# Rays whose rows are held at a time; smaller batches lose the second core, larger ones fall out of the cache.
-CHUNK = 16_384
 # Kept samples are given up where they would take more than this many bytes.
 KEEP_LIMIT = 2**30
 # The Jacobian of other unknowns than a table's entries takes one march for each.
@@ -167,11 +164,11 @@ def fit(
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
     _check(problem, solver)
 
-    observations = observe(scene, cameras, targets, weights, settings)
-    chunk = min(CHUNK, -(-observations.size // shares()))
-    problem, dealt = _keep(problem, observations.dealt(chunk), chunk, keep_samples)
-    evaluator = Evaluator(problem, dealt, chunk, cameras, targets)
-    mark = checkpoints.fingerprint(problem, observations, solver) if checkpoint else {}
+    problem, observations = _keep(problem, observe(scene, cameras, targets, weights, settings), keep_samples)
+    evaluator = Evaluator(problem, observations, cameras, targets)
+    mark = checkpoints.fingerprint(problem, (cameras, targets, weights), solver) if checkpoint else {}
+    # The observations hold them.
+    del targets
     state, history = solver.init(evaluator.functions, chosen.unconstrained_from_model(model)), []
     if checkpoint and resume and Path(checkpoint).exists():
         state, rows = checkpoints.load(Path(checkpoint), state, mark)
@@ -267,7 +264,7 @@ def _check(problem: Problem, solver: AbstractSolver) -> None:
         )
 
 
-def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool | int) -> tuple[Problem, Observations]:
+def _keep(problem: Problem, observations: Observations, keep: bool | int) -> tuple[Problem, Observations]:
     """Samples along the rays, where the volume and its clipping are known and memory allows."""
     among = lambda select: problem.unknowns.among(problem.model, select)
     moving = among(lambda m: (m.scene.volume, m.scene.clipping))
@@ -278,7 +275,7 @@ def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool |
     # Colours and extinctions of a table leave its ends where they are; whatever else it has may move them.
     entries = lambda transfer: (transfer.rgb, transfer.sigma_t) if isinstance(transfer, AbstractTable) else ()
     clamped = among(lambda m: m.scene.transfer) == among(lambda m: entries(m.scene.transfer))
-    kept = keep_samples(problem.model.scene, observations, problem.settings, chunk, limit, clamped=clamped)
+    kept = keep_samples(problem.model.scene, observations, problem.settings, limit, clamped=clamped)
     if kept is None:
         return problem, observations
     return problem.with_samples(kept[0]), kept[1]
@@ -286,9 +283,9 @@ def _keep(problem: Problem, observations: Observations, chunk: int, keep: bool |
 
 def _iteration(evaluator: Evaluator, solver: AbstractSolver, state: Any, step: int, seconds: float) -> Iteration:
     unconstrained, loss = solver.iterate(state)
-    level = int(getattr(state, "level", len(evaluator.levels) - 1))
+    level = int(getattr(state, "level", -1))
     psnr = evaluator.psnr(unconstrained, loss, getattr(state, "normal", None))
-    return Iteration(step, loss, psnr, seconds, evaluator.levels[level].size / evaluator.rays)
+    return Iteration(step, loss, psnr, seconds, evaluator.fraction(level))
 
 
 def _least_determined(

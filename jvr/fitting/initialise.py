@@ -7,7 +7,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jvr.execution.devices import shares
 from jvr.fitting.losses import SquaredError
 from jvr.fitting.normal_equations import normal_equations
 from jvr.fitting.observations import check_images, observe
@@ -52,11 +51,10 @@ def colours_given_extinction(
     unknowns = choose_unknowns(ExposedModel(scene, None), lambda m: colours(m.scene))
     problem = Problem(ExposedModel(scene, None), unknowns, settings, SquaredError(), (), None)
     observations = observe(scene, cameras, targets, None, settings)
-    chunk = min(16_384, -(-observations.size // shares()))
     start = jnp.ravel(scene.transfer.rgb)
     matrix, vector = np.zeros((start.size,) * 2), np.zeros(start.size)
-    for tile in observations.dealt(chunk).tiles(chunk):
-        normal = normal_equations(problem, start, tile)
+    for i in range(observations.tile_count()):
+        normal = normal_equations(problem, start, observations, i)
         matrix += np.asarray(normal.matrix, np.float64)
         vector += np.asarray(normal.vector, np.float64)
     scale = max(np.diag(matrix).max(), np.finfo(float).tiny)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jvr.execution.devices import everywhere, over_rays
 from jvr.fitting.kinds import Kinds, TableEntries
@@ -92,28 +92,42 @@ def _light_tangents(problem: Problem, values: Float[Array, "unknowns"]) -> Light
 
 
 def normal_equations(
-    problem: Problem, values: Float[Array, "unknowns"], tile: Observations, around: LightTangents | None = None
+    problem: Problem,
+    values: Float[Array, "unknowns"],
+    observations: Observations,
+    index: int = 0,
+    every: int = 1,
+    around: LightTangents | None = None,
 ) -> Normal:
-    """The sums of `Normal` over one tile of rays, in float64; `around`: what `light_tangents` returns, else made for this tile alone.
+    """The sums of `Normal` over one tile of every share (`Observations.tile`), in float64; `around`: what `light_tangents` returns, else
+    made for this tile alone.
 
     The rows have the precision of `values`, their products are summed in float64. A matrix summed in float32 is uncertain by 1e-7, and
     already an eigenvalue of 1e-7 is a combination of unknowns that changes the images by 3e-4 of what a single one does.
     """
-    channels = _channels(problem, values, tile, around)
+    channels = _channels(problem, values, observations, (jnp.int32(index), jnp.int32(every)), around)
     with jax.enable_x64(True):
         return _sums(channels, values.size)
 
 
 @eqx.filter_jit
 def _channels(
-    problem: Problem, values: Float[Array, "unknowns"], tile: Observations, around: LightTangents | None
+    problem: Problem,
+    values: Float[Array, "unknowns"],
+    observations: Observations,
+    place: tuple[Int[Array, ""], Int[Array, ""]],
+    around: LightTangents | None,
 ) -> list[_Channel]:
     shared, stored = problem.apart()
 
-    def share(shared: tuple[Problem, Array, LightTangents | None], rays: tuple[Array | None, Observations]) -> list[_Channel]:
-        return _share_of_channels(shared[0].reassembled(rays[0]), shared[1], rays[1], shared[2])
+    def share(
+        shared: tuple[Problem, Array, Any, LightTangents | None], rays: tuple[Array | None, Observations]
+    ) -> list[_Channel]:
+        problem, values, place, around = shared
+        stored, observations = rays
+        return _share_of_channels(problem.reassembled(stored), values, observations.tile(*place), around)
 
-    return over_rays(share, (shared, values, around), (stored, tile))
+    return over_rays(share, (shared, values, place, around), (stored, observations))
 
 
 def _share_of_channels(

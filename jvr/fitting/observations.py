@@ -1,14 +1,15 @@
 """Observations: target images as one long list of rays with their colours, and samples cached along them."""
 
+import functools
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt16
 
 from jvr.execution.devices import everywhere, on_devices, over_rays, shares
 from jvr.march.fields import MISSING, CachedSamples, VoxelField
@@ -25,54 +26,54 @@ from jvr.rendering.medium import environment, medium, occupancy, visibility
 from jvr.rendering.sampling import Uniform
 from jvr.rendering.settings import Settings
 from jvr.rendering.trace import Prepared, ahead, enter, near_volume, step_length
-from jvr.types import Triple
+from jvr.types import Scalar, Triple
+
+# Rays whose rows are held at a time; smaller batches lose the second core, larger ones fall out of the cache.
+CHUNK = 16_384
 
 
-class Observations(eqx.Module):
-    """World rays with the colour that each should have, in shares of as many rays for each device; in each, rays that cross more of the
-    volume come first.
-
-    A ray starts at `origin + low`, the eye is `behind` that by so much (see `AbstractCamera.rays_ahead`).
-
-    `weight` is 0 for the rays that fill up the last chunk of a share. `start` is where a ray's kept samples begin in what its device
-    holds, all 0 without any.
-    """
+class WorldRays(NamedTuple):
+    """Rays wherever in the world: one starts at `origin + low`, the eye is `behind` that by so much (see `AbstractCamera.rays_ahead`)."""
 
     origin: Triple
     low: Triple
-    behind: Float[Array, "rays"]
     direction: Triple
-    target: Float[Array, "rays 3"]
-    weight: Float[Array, "rays"]
-    start: Int[Array, "rays"]
+    behind: Float[Array, "..."]
+
+
+class Observations(eqx.Module):
+    """World rays with the colour that each should have, `(tiles, rays)`: as many tiles for each device, its share; in each share, rays
+    that cross more of the volume come first. A fit holds them once, and takes its tiles out of them within its programs.
+
+    `weight` is 0 for the rays that fill up a share. `start` is where a ray's kept samples begin in what its device holds, all 0 without
+    any.
+    """
+
+    rays: WorldRays
+    target: Float[Array, "*tiles rays 3"]
+    weight: Float[Array, "*tiles rays"]
+    start: Int[Array, "*tiles rays"]
 
     @property
     def size(self) -> int:
-        return self.weight.shape[0]
+        return self.weight.size
 
-    def dealt(self, chunk: int) -> "Observations":
-        """Dealt out in turn to `shares()`, each filled up to whole chunks."""
-        order = np.arange(self.size)
-        order = np.pad(order, (0, -len(order) % (chunk * shares())), mode="edge")
-        filled = jax.tree.map(lambda x: x[order], self)
-        filled = eqx.tree_at(lambda o: o.weight, filled, filled.weight.at[self.size :].set(0))
-        return jax.tree.map(lambda x: x[order.reshape(-1, shares()).T.ravel()], filled)
+    @property
+    def chunk(self) -> int:
+        """Rays of a tile."""
+        return self.weight.shape[-1]
 
-    def subsampled(self, every: int, chunk: int) -> "Observations":
-        """Every `every`-th ray of each share, filled up to whole chunks."""
+    def tile_count(self, every: int = 1) -> int:
+        """How many tiles of each share every `every`-th of its rays fill."""
         each = self.size // shares()
-        index = np.arange(0, each, every)
-        kept = len(index)
-        index = np.pad(index, (0, -kept % chunk))
-        subsample = jax.tree.map(lambda x: x.reshape(shares(), each, *x.shape[1:])[:, index], self)
-        subsample = eqx.tree_at(lambda o: o.weight, subsample, subsample.weight.at[:, kept:].set(0))
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), subsample)
+        return -(-each // (every * self.chunk))
 
-    def tiles(self, chunk: int) -> list["Observations"]:
-        """One chunk of every share at a time."""
-        split = jax.tree.map(lambda x: x.reshape(shares(), -1, chunk, *x.shape[1:]), self)
-        of_all = lambda i: jax.tree.map(lambda x: on_devices(x[:, i].reshape(-1, *x.shape[3:])), split)
-        return [of_all(i) for i in range(self.size // (chunk * shares()))]
+    def tile(self, index: Int[Array, ""] | int, every: Int[Array, ""] | int = 1) -> "Observations":
+        """One of these tiles, of what one device holds: `(rays,)`."""
+        rank = (index * self.chunk + jnp.arange(self.chunk)) * every
+        inside = rank < self.size
+        one = jax.tree.map(lambda x: x.reshape(self.size, *x.shape[2:])[jnp.where(inside, rank, 0)], self)
+        return eqx.tree_at(lambda o: o.weight, one, jnp.where(inside, one.weight, 0))
 
 
 class Samples(eqx.Module):
@@ -138,8 +139,10 @@ def observe(
     images: Sequence[np.ndarray],
     weights: Sequence[Any] | None,
     settings: Settings,
+    chunk: int | None = None,
 ) -> Observations:
-    """All pixels of all images as observations, sorted by the length of their rays.
+    """All pixels of all images as observations, in tiles of at most `chunk` rays, `CHUNK` without it. Sorted by how much of the volume they
+    cross, rays are dealt out in turn to the devices.
 
     **Raises** `ValueError` for settings that fits do not support.
     """
@@ -147,68 +150,72 @@ def observe(
         raise ValueError("a fit resamples the midpoints of segments: leave Settings(quadrature=...) at jvr.Midpoint()")
     if not isinstance(settings.sampling, Uniform):
         raise ValueError("a fit takes every sample of every ray: leave Settings(sampling=...) at jvr.Uniform()")
+    weights = _check_weights(cameras, weights, images[0].dtype)
     # Compiled for all cameras of one size and kind.
     rays = [_rays(scene, camera) for camera in cameras]
-    (origin, low), direction, behind = jax.tree.map(lambda *parts: np.concatenate(parts), *rays)
-    target = np.concatenate([image.reshape(-1, 3) for image in images])
-    weight = np.concatenate([w.ravel() for w in _check_weights(cameras, weights, target.dtype)])
-    shared = lambda tree: jax.tree.map(jnp.asarray, tree)
-    start = jnp.zeros(len(behind), jnp.int32)
-    placed = (shared(origin), shared(low), shared(behind), shared(direction))
-    whole = Observations(*placed, jnp.asarray(target), jnp.asarray(weight), start)
-    order = np.argsort(-np.asarray(_inside(scene, whole).length), kind="stable")
-    return jax.tree.map(lambda x: x[order], whole)
+    length = np.concatenate([np.asarray(_inside(scene, one).length) for one in rays])
+    order = np.argsort(-length, kind="stable").astype(np.int32)
+    chunk = min(chunk or CHUNK, -(-order.size // shares()))
+    together = chunk * shares()
+    rank = np.arange(-(-order.size // together) * together, dtype=np.int32).reshape(-1, shares()).T.reshape(-1, chunk)
+    pixel = order[np.minimum(rank, order.size - 1)]
+    structure = jax.tree.structure(rays[0])
+    columns = [list(parts) for parts in zip(*map(jax.tree.leaves, rays), strict=True)]
+    del rays
+    # One number of all rays after the other, so that they are not all held twice.
+    placed = [on_devices(np.concatenate(columns.pop(0))[pixel]) for _ in range(len(columns))]
+    target = on_devices(np.concatenate([image.reshape(-1, 3) for image in images])[pixel])
+    weight = np.where(rank < order.size, np.concatenate([w.ravel() for w in weights])[pixel], 0)
+    start = on_devices(np.zeros(rank.shape, np.int32))
+    return Observations(jax.tree.unflatten(structure, placed), target, on_devices(weight), start)
 
 
 @jax.jit
-def _rays(scene: Scene, camera: AbstractCamera) -> tuple[tuple[Triple, Triple], Triple, Float[Array, "rays"]]:
+def _rays(scene: Scene, camera: AbstractCamera) -> WorldRays:
     """The rays of a camera from near the volume on: starts in the world as two floats, directions, and the distances from the eye."""
     zero = scene.volume.origin
     scene, camera = near_volume(scene, camera)
     pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
     origin, direction, behind = camera.rays_ahead(pixels, ahead(scene, camera))
     starts = [two_sum(zero.high[i], zero.low[i], x) for i, x in enumerate(origin)]
-    return (tuple(high for high, _ in starts), tuple(low for _, low in starts)), direction, behind
+    return WorldRays(tuple(high for high, _ in starts), tuple(low for _, low in starts), direction, behind)
 
 
 @jax.jit
-def _inside(scene: Scene, tile: Observations) -> Rays:
+def _inside(scene: Scene, rays: WorldRays) -> Rays:
     """The rays inside of the volume, wherever that is in the world."""
     zero = jax.lax.stop_gradient(scene.volume.origin)
     (scene,) = near_volume(scene)
     origin = tuple(
         Exact(high, low).minus(Exact(zero.high[i], zero.low[i])).rounded()
-        for i, (high, low) in enumerate(zip(tile.origin, tile.low, strict=True))
+        for i, (high, low) in enumerate(zip(rays.origin, rays.low, strict=True))
     )
-    return enter(scene, origin, tile.direction, tile.behind)[0]
+    return enter(scene, origin, rays.direction, rays.behind)[0]
 
 
 def keep_samples(
-    scene: Scene, observations: Observations, settings: Settings, chunk: int, limit: int, *, clamped: bool
+    scene: Scene, observations: Observations, settings: Settings, limit: int, *, clamped: bool
 ) -> tuple[Samples, Observations] | None:
     """Resamples the volume along every ray once, 16 bits a sample, or returns `None` where that would take more than `limit` bytes.
 
     The error of a kept sample is at most 2^-17 of the range of the volume's values, of those between the ends of a table where these stay
     (`clamped`).
     """
-    tiles = observations.tiles(chunk)
-    counts = [int(_longest(scene, tile, settings)) for tile in tiles]
-    total = chunk * sum(counts)
+    chunk, dt = observations.chunk, step_length(scene, settings)
+    counts = np.max(np.asarray(_segments(scene, observations, dt)).reshape(shares(), -1), axis=0)
+    ends = chunk * np.cumsum(counts, dtype=np.int64)
+    total = int(ends[-1])
     if 2 * total * shares() > limit or total >= 2**31:
         return None
     low, high = _kept_range(scene, clamped)
     scale = jnp.where(high > low, (high - low) / (MISSING - 1), 1.0)
-    stored = np.empty((shares(), total), np.uint16)
-    starts, begin = [], 0
-    for tile, count in zip(tiles, counts, strict=True):
-        for k in range(count):
-            found = _resample(scene, tile, settings, jnp.int32(k), low, scale)
-            stored[:, begin + k * chunk : begin + (k + 1) * chunk] = found.reshape(shares(), chunk)
-        starts.append(begin + np.arange(chunk, dtype=np.int32))
-        begin += chunk * count
-    start = np.tile(np.concatenate(starts), shares())
-    kept = eqx.tree_at(lambda o: o.start, observations, jnp.asarray(start))
-    return Samples(on_devices(stored.ravel()), low, scale, chunk, scene.volume.gaps is not None), kept
+    stored = on_devices(np.zeros(shares() * total, np.uint16))
+    begins = (ends - chunk * counts).astype(np.int32)
+    for i, (begin, count) in enumerate(zip(begins, counts, strict=True)):
+        stored = _resample(stored, scene, observations, (jnp.int32(i), jnp.int32(begin), jnp.int32(count)), dt, low, scale)
+    start = np.tile(begins[:, None] + np.arange(chunk, dtype=np.int32), (shares(), 1))
+    kept = eqx.tree_at(lambda o: o.start, observations, on_devices(start))
+    return Samples(stored, low, scale, chunk, scene.volume.gaps is not None), kept
 
 
 def _kept_range(scene: Scene, clamped: bool) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -240,32 +247,52 @@ def observed_medium(
     scene: Scene, tile: Observations, samples: Samples | None, settings: Settings, prepared: Prepared
 ) -> tuple[Medium, Rays]:
     """What the rays of a tile march through, resampled anew or from kept samples, and the rays inside of it."""
-    rays = _inside(scene, tile)
+    rays = _inside(scene, tile.rays)
     through = medium(near_volume(scene)[0], settings, prepared)
     if samples is not None:
         through = through._replace(field=samples.along(tile.start))
     return through, rays
 
 
-@eqx.filter_jit
-def _longest(scene: Scene, tile: Observations, settings: Settings) -> Int[Array, ""]:
-    rays = _inside(scene, tile)
-    return everywhere(jnp.max(segment_count(rays.length, step_length(scene, settings))))
+@jax.jit
+def _segments(scene: Scene, observations: Observations, dt: Scalar) -> Int[Array, "tiles"]:
+    """Of the longest ray of each tile."""
+
+    def share(shared: tuple[Scene, Scalar], observations: Observations) -> Int[Array, "tiles"]:
+        scene, dt = shared
+        return jax.vmap(lambda rays: jnp.max(segment_count(_inside(scene, rays).length, dt)))(observations.rays)
+
+    return everywhere(over_rays(share, (scene, dt), observations))
 
 
-@eqx.filter_jit
-def _resample(scene: Scene, tile: Observations, settings: Settings, k: Int[Array, ""], low: Array, scale: Array) -> Array:
-    def share(shared: tuple[Scene, Array, Array, Array], tile: Observations) -> Array:
-        scene, k, low, scale = shared
-        rays, dt = _inside(scene, tile), step_length(scene, settings)
-        _, u = segment_span(k, segment_count(rays.length, dt), rays.length, dt)
-        found = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
-        level = jnp.clip(jnp.round((found.s - low) / scale), 0, MISSING - 1)
-        for known in found.known:
-            level = jnp.where(known > 0.5, level, MISSING)
-        return level.astype(jnp.uint16)
+@functools.partial(jax.jit, donate_argnums=0)
+def _resample(
+    stored: UInt16[Array, "samples"],
+    scene: Scene,
+    observations: Observations,
+    place: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]],
+    dt: Scalar,
+    low: Array,
+    scale: Array,
+) -> UInt16[Array, "samples"]:
+    """What is `stored`, with the samples of one tile of each share: its index, where they begin, and how many there are of each ray."""
 
-    return everywhere(over_rays(share, (scene, k, low, scale), tile))
+    def share(shared: Any, own: tuple[Array, Observations]) -> Array:
+        scene, (index, begin, count), dt, low, scale = shared
+        stored, observations = own
+        rays = _inside(scene, observations.tile(index).rays)
+
+        def one(k: Int[Array, ""], stored: Array) -> Array:
+            _, u = segment_span(k, segment_count(rays.length, dt), rays.length, dt)
+            found = jax.vmap(VoxelField(scene.volume).resample)(points_at(rays, jnp.arange(u.size, dtype=jnp.int32), k, u))
+            level = jnp.clip(jnp.round((found.s - low) / scale), 0, MISSING - 1)
+            for known in found.known:
+                level = jnp.where(known > 0.5, level, MISSING)
+            return jax.lax.dynamic_update_slice(stored, level.astype(jnp.uint16), (begin + k * u.size,))
+
+        return jax.lax.fori_loop(0, count, one, stored)
+
+    return over_rays(share, (scene, place, dt, low, scale), (stored, observations))
 
 
 def _check_weights(cameras: Sequence[AbstractCamera], weights: Sequence[Any] | None, dtype: Any) -> list[np.ndarray]:
