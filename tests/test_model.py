@@ -71,10 +71,10 @@ ERRORS = {
         ValueError,
         "must be (3)",
     ),
-    "step zero": (lambda: jvr.Settings(0.0), ValueError, "step must be a positive"),
-    "step infinite": (lambda: jvr.Settings(np.inf), ValueError, "step must be a positive"),
+    "step zero": (lambda: jvr.Settings(0.0), ValueError, "step must be positive"),
+    "step infinite": (lambda: jvr.Settings(np.inf), ValueError, "step must be positive"),
     "termination 1": (lambda: jvr.Settings(termination=1.0), ValueError, "in [0, 1)"),
-    "tile zero": (lambda: jvr.Settings(tile=0), ValueError, "positive number of rays"),
+    "tile zero": (lambda: jvr.Settings(tile=0), ValueError, "tile must be a whole number of at least 1"),
     "window zero": (lambda: jvr.presets.window_level(0.0, 40.0), ValueError, "window must be positive"),
 }
 

@@ -1,20 +1,27 @@
 """A parameter is declared once, beside its field: constructors, fits, configurations, saved scenes and the reference go by that."""
 
+import dataclasses
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jvr
+from jvr.fitting.bijectors import bijector_of
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 from jvr.io.config import ConfigError, build_scene, config_from
+from jvr.io.config.schema.parts import table_of
+from jvr.io.kinds import KINDS, PARTS
+from jvr.io.reference import markdown, public_parameters
 from jvr.model.exact import Exact
-from jvr.model.light import AbstractLight, LightSample
-from jvr.model.parameters import GREY_OR_RGB, assign, choice, parameter
+from jvr.model.light import AbstractEmitter, AbstractLight, LightSample
+from jvr.model.parameters import GREY_OR_RGB, alternatives, assign, choice, declared, parameter, parts_of, range_at
 from jvr.model.phase import AbstractPhase, ScatteringAngle, components
 from jvr.model.ranges import ANY, RADIANCE, Interval
 from jvr.types import ArrayLike, Channels, Scalar, Triple, Vector
@@ -61,8 +68,15 @@ class LinearPhase(AbstractPhase):
         return tuple(b / 3 for (b,) in components(self.b))
 
 
-jvr.register("lamp", LampLight)
-jvr.register("linear", LinearPhase)
+@pytest.fixture(scope="module", autouse=True)
+def _registered():
+    """Known to files while these tests run, and not to others."""
+    jvr.register("lamp", LampLight)
+    jvr.register("linear", LinearPhase)
+    yield
+    for family, kind, name in ((AbstractEmitter, "lamp", "LampLight"), (AbstractPhase, "linear", "LinearPhase")):
+        del KINDS[family][kind], PARTS[name]
+
 
 CONFIG = """
 [volume]
@@ -167,3 +181,242 @@ def test_only_families_and_free_names_are_registered():
         jvr.register("point", LampLight)
     # As a notebook does that runs a cell again.
     jvr.register("lamp", LampLight)
+
+
+# --- Every public class ----------------------------------------------------------------------------------------------
+
+RGB = [[0.2, 0.3, 0.4], [0.5, 0.6, 0.7]]
+POSE = np.eye(4)
+# What a constructor needs, for every public class with parameters.
+EXAMPLES: dict[str, dict[str, Any]] = {
+    "AmbientLight": {},
+    "AnalyticGradient": {},
+    "BlinnPhong": {},
+    "BlinnPhongBRDF": {},
+    "ByValue": {"positions": [0.0, 1.0], "values": [0.2, 0.4]},
+    "CentralDifferences": {},
+    "ClippingBox": {"lower": [0.0, 0.0, 0.0], "upper": [1.0, 1.0, 1.0]},
+    "DeepShadowMap": {},
+    "Dipole": {"sigma_s_prime": [1.0, 2.0, 3.0], "sigma_a": [0.1, 0.2, 0.3]},
+    "DirectionalLight": {"direction": [0.0, 0.0, 1.0]},
+    "DoubleHenyeyGreenstein": {"g1": 0.3, "g2": -0.3, "weight": 0.5},
+    "Draine": {"g": 0.3, "alpha": 1.0},
+    "EnvironmentLight": {"coefficients": [[1.0, 1.0, 1.0]]},
+    "ForwardDifferences": {},
+    "GaussianTransfer": {"center": [0.0, 1.0], "width": [0.1, 0.2], "height": [1.0, 2.0], "rgb": RGB},
+    "GradientOpacity": {"transfer": jvr.LinearTransfer([0.0, 1.0], RGB, [0.0, 1.0]), "low": 0.1, "high": 0.2},
+    "GradientTransfer": {"rgb": [RGB, RGB], "sigma_t": [[0.1, 0.2], [0.3, 0.4]], "domain": [0.0, 1.0], "magnitudes": [0.0, 1.0]},
+    "HarmonicMaterial": {"tinted": None, "plain": None, "positions": [0.0, 1.0]},
+    "HeadLight": {},
+    "HenyeyGreenstein": {"g": 0.3},
+    "JendersieEon": {"diameter": 10.0},
+    "Lambert": {},
+    "LambertBRDF": {},
+    "LinearTransfer": {"positions": [0.0, 1.0], "rgb": RGB, "sigma_t": [0.1, 0.2]},
+    "LutTransfer": {"rgb": RGB, "sigma_t": [0.1, 0.2], "domain": [0.0, 1.0]},
+    "MaterialByValue": {"positions": [0.0, 1.0], "materials": [jvr.LambertBRDF(), jvr.LambertBRDF()]},
+    "MerlBRDF": {"table": np.full((2, 2, 2, 3), 0.1)},
+    "MicrofacetBRDF": {},
+    "Mixture": {"phases": [jvr.Isotropic(), jvr.Rayleigh()], "weights": [1.0, 2.0]},
+    "OpacityShadowMap": {},
+    "OrthographicCamera": {"world_from_camera": POSE, "height_world": 1.0, "width": 2, "height": 2},
+    "PerspectiveCamera": {"world_from_camera": POSE, "fov_y": 30.0, "width": 2, "height": 2},
+    "PhaseBRDF": {"phase": jvr.Isotropic()},
+    "Phong": {},
+    "PhongBRDF": {},
+    "PointLight": {"position": [0.0, 0.0, 1.0], "attenuation": [1.0, 0.5, 0.5]},
+    "PrecomputedGradient": {},
+    "RadianceTransfer": {"chromaticity": 1, "bleeding": jvr.TransferBleeding()},
+    "Scene": {"volume": SCENE.volume, "transfer": SCENE.transfer, "background": [0.1, 0.2, 0.3]},
+    "Schlick": {"k": 0.3},
+    "ShadowMap": {},
+    "ShadowRays": {},
+    "ShadowVolume": {},
+    "SingleScattering": {"threshold": 0.5},
+    "SobelDifferences": {},
+    "SpotLight": {"position": [0.0, 0.0, 1.0], "direction": [0.0, 0.0, -1.0], "attenuation": [1.0, 0.5, 0.5]},
+    "TabulatedPhase": {"angles": [0.0, 1.0, np.pi], "values": [1.0, 0.5, 0.2]},
+    "Volume": {"values": np.zeros((2, 2, 2), np.float32)},
+}
+# Ends that another parameter forbids.
+FORBIDDEN = {
+    ("SpotLight", "inner", 180.0): "outer is larger",
+    ("SpotLight", "outer", 0.0): "inner is smaller",
+    ("GradientOpacity", "high", 0.0): "low is smaller",
+    ("RadianceTransfer", "order", 0): "chromaticity is at most that",
+    ("RadianceTransfer", "chromaticity", 10): "the order is at least that",
+}
+# Arrays that are no parameters, and why.
+UNDECLARED = {
+    ("HarmonicMaterial", "tinted"): "made by project",
+    ("HarmonicMaterial", "plain"): "made by project",
+    ("PrecomputedGradient", "gradients"): "made of a volume",
+    ("Volume", "values"): "voxels of any type, checked on their own",
+    ("Volume", "world_from_grid"): "an affine transform, checked on its own",
+    ("Volume", "bricks"): "made of the voxels",
+    ("Volume", "squares"): "made of the voxels",
+    ("Volume", "gradients"): "made of the voxels",
+}
+# Where a configuration says a part of a family.
+PLACES = {
+    "AbstractEmitter": "lights",
+    "AbstractShading": "shading",
+    "AbstractShadows": "shadows",
+    "AbstractScattering": "scattering",
+    "AbstractPhase": "scattering.phase",
+    "AbstractNormals": "normals",
+    "AbstractBRDF": "material",
+    "AbstractTransfer": "transfer",
+    "AbstractRadianceTransfer": "radiance_transfer",
+}
+
+
+def public_class(name: str) -> type:
+    return getattr(jvr, name)
+
+
+def test_every_public_class_with_parameters_has_an_example():
+    with_parameters = {name for name in PARTS if name[0].isupper() and not isinstance(PARTS[name], type)}
+    assert {name for name in with_parameters if declared(public_class(name))} == set(EXAMPLES)
+
+
+def test_no_public_array_is_undeclared():
+    fields = [(name, f) for name in PARTS if not isinstance(PARTS[name], type) for f in dataclasses.fields(public_class(name))]
+    found = {(name, f.name) for name, f in fields if "parameter" not in f.metadata and not f.metadata.get("static")}
+    parts = {(name, f.name) for name, f in fields if (name, f.name) in found and issubclass_of_part(f.type)}
+    assert found - parts == set(UNDECLARED) - parts
+
+
+def issubclass_of_part(annotation: Any) -> bool:
+    """Whether a field holds another public class, which declares its own."""
+    return any(cls.__name__ in PARTS or cls.__name__.startswith("Abstract") for cls in parts_of(annotation))
+
+
+def ends_of(within: Interval, step: float) -> tuple[list[float], list[float]]:
+    """Values at the ends of an interval that belong to it, and that do not."""
+    inside, outside = [], []
+    for end, sign, mark in ((within.low, -1, within.ends[0]), (within.high, 1, within.ends[1])):
+        if not np.isfinite(end):
+            continue
+        is_open = mark in "()"
+        near, far = (end - sign * step, end) if is_open else (end, end + sign * step)
+        inside.append(near)
+        outside.append(far)
+    return inside, outside
+
+
+def cases() -> list[Any]:
+    """Class, parameter, a value of it in its range or just outside, and which of the two."""
+    found = []
+    for name in EXAMPLES:
+        for field in declared(public_class(name)).values():
+            within, is_whole = field.metadata["parameter"].within, int in alternatives(field.type)
+            if isinstance(within, Interval) and not parts_of(field.type) and field.type is not bool:
+                inside, outside = ends_of(
+                    within, 1 if is_whole else 1e-3 * max(abs(within.low), 1.0) if np.isfinite(within.low) else 1e-3
+                )
+                kind = int if is_whole else float
+                # Brighter light than fits make is taken.
+                outside = [x for x in outside if not (within.light and x > 0)]
+                found += [pytest.param(name, field.name, kind(x), True, id=f"{name}.{field.name}={x:g}") for x in inside]
+                found += [pytest.param(name, field.name, kind(x), False, id=f"{name}.{field.name}!={x:g}") for x in outside]
+    return found
+
+
+def with_value(name: str, field: str, value: float | int) -> dict[str, Any]:
+    """The keywords of an example with a value in place of a parameter's first number."""
+    before = np.asarray(getattr(public_class(name)(**EXAMPLES[name]), field))
+    if before.ndim == 0:
+        return EXAMPLES[name] | {field: value}
+    array = np.array(before, np.float64)
+    array.flat[0] = value
+    return EXAMPLES[name] | {field: array.tolist()}
+
+
+@pytest.mark.parametrize(("name", "field", "value", "is_inside"), cases())
+def test_constructors_and_configurations_keep_to_what_is_declared(name, field, value, is_inside):
+    keywords, cls = with_value(name, field, value), public_class(name)
+    if (name, field, value) in FORBIDDEN:
+        return
+    if is_inside:
+        part = cls(**keywords)
+        assert np.asarray(getattr(part, field)).flat[0] == pytest.approx(value, rel=1e-6)
+    else:
+        with pytest.raises(ValueError, match=rf"^{field} must be "):
+            cls(**keywords)
+    family = next((base for base, kinds in KINDS.items() if name in kinds.values() and base.__name__ in PLACES), None)
+    if family is None or field not in table_of(cls).model_fields:
+        return
+    place, kind = PLACES[family.__name__], next(kind for kind, known in KINDS[family].items() if known == name)
+    plain = {key: given for key, given in keywords.items() if not isinstance(given, eqx.Module | list) or is_numbers(given)}
+    table = {"kind": kind} | plain | OTHERWISE.get(name, {})
+    data = data_with(place, table)
+    if is_inside:
+        config_from(data, "config.toml")
+    else:
+        key = f"{place}[0].{field}" if place == "lights" else f"{place}.{field}"
+        with pytest.raises(ConfigError, match=rf"^config\.toml: {re.escape(key)}(\[0\])*: .*must be .*, not "):
+            config_from(data, "config.toml")
+
+
+# In place of parts, what a configuration calls them.
+OTHERWISE: dict[str, dict[str, Any]] = {
+    "Mixture": {"phases": ["isotropic", "rayleigh"]},
+    "PhaseBRDF": {"phase": "isotropic"},
+    "RadianceTransfer": {"bleeding": "transfer"},
+}
+
+
+def is_numbers(value: Any) -> bool:
+    return isinstance(value, list) and not any(isinstance(entry, eqx.Module) for entry in value)
+
+
+def data_with(place: str, table: dict[str, Any]) -> dict[str, Any]:
+    """A configuration with a table at its place, and whatever else is needed."""
+    data: dict[str, Any] = {
+        "volume": {"builtin": "demo"},
+        "transfer": {"kind": "window"},
+        "lights": [{"kind": "directional", "direction": [0, 0, 1]}],
+        "shading": {"kind": "lambert"},
+        "environment": "constant",
+        "material": "lambert",
+    }
+    if place == "scattering.phase":
+        return data | {"scattering": {"phase": table}}
+    return data | {place: [table] if place == "lights" else table}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_fits_keep_to_what_is_declared(name):
+    """Whatever a solver asks for, an array ends up in its range, and comes to its ends."""
+    part = public_class(name)(**EXAMPLES[name])
+    for path, leaf in jax.tree_util.tree_leaves_with_path(part):
+        within = range_at(part, path)
+        if not isinstance(within, Interval) or not jnp.issubdtype(leaf.dtype, jnp.floating):
+            continue
+        for bounds in (None, ANY):
+            bijector = bijector_of(within, leaf, jnp.ones(()), bounds)
+            lower, upper = bijector.bounds(np.zeros(leaf.shape))
+            for far, end in ((-1e6, within.low), (1e6, within.high)):
+                values = np.asarray(bijector.forward(jnp.asarray(np.clip(np.full(leaf.shape, far), lower, upper), jnp.float32)))
+                assert np.all(within.closed.holds(values) | np.isinf(values))
+                if np.isfinite(end):
+                    # Open ends are kept away from by a millionth of the interval's length.
+                    length = within.high - within.low if np.isfinite(within.high - within.low) else 1.0
+                    np.testing.assert_allclose(values, end, atol=3e-6 * max(abs(end), length, 1.0))
+
+
+# --- The reference ---------------------------------------------------------------------------------------------------
+
+
+def test_the_reference_says_what_is_declared():
+    found = public_parameters()
+    g, *_ = found["HenyeyGreenstein"]
+    assert (g.name, g.shape, g.range, g.default) == ("g", "() or (3,) or jvr.ByValue", "between -1 and 1, without either", "")
+    diameter = found["JendersieEon"][0]
+    assert (diameter.range, diameter.unit) == ("in [5, 50]", "micrometres")
+    assert {e.name: e.default for e in found["ShadowRays"]} == {"step": "1", "termination": "0.001"}
+    assert "remainder" not in {e.name for e in found["PointLight"]}
+    assert all(e.doc for entries in found.values() for e in entries)
+    rows = markdown(found["OpacityShadowMap"]).splitlines()
+    assert rows[2] == "| `texels` | rays along each axis of the map |  | whole, of at least 2 | `128` |"

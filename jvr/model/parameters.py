@@ -136,7 +136,8 @@ def _checked(field: dataclasses.Field, value: Any, lengths: dict[str, int]) -> A
         return _parts(field, value, classes, lengths)
     if classes:
         if not isinstance(value, classes):
-            raise TypeError(f"{field.name} must be {about.doc}, not {type(value).__name__}")
+            found = repr(value) if isinstance(value, str) else type(value).__name__
+            raise TypeError(f"{field.name} must be {about.doc}, not {found}")
         return value
     if about.by_scalar and isinstance(value, AbstractByScalar):
         require_within(value.values, field.name, about)

@@ -14,10 +14,11 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jvr.execution.devices import once, spread
 from jvr.model.bricks import Bricks, bricks_of
-from jvr.model.checks import affine, float_array, require
+from jvr.model.checks import affine, require
 from jvr.model.exact import Exact, Remainder
 from jvr.model.kept import is_made_of, made_by, note_sources
 from jvr.model.packing import Squares, squares_of
+from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.voxels import CELL, VOXEL, as_missing, in_memory, masked_voxels, typical_range, without_gaps
 from jvr.numerics import add_runs, read_at, read_run, transformed, turned
@@ -112,16 +113,16 @@ class Volume(AbstractPart):
 
     values: Voxels
     world_from_grid: Affine
-    slope: Scalar
-    intercept: Scalar
-    interpolation: AbstractInterpolation
+    slope: Scalar = parameter(doc="scalar for each unit of a voxel, not 0")
+    intercept: Scalar = parameter(doc="scalar where a voxel is 0")
+    interpolation: AbstractInterpolation = parameter(doc="jvr.Trilinear() or jvr.Nearest()")
     bricks: Bricks | None = eqx.field(init=False, metadata=made_by("bricked"))
     squares: Squares | None = eqx.field(init=False, metadata=made_by("packed"))
     gradients: Float[Array, "x y z 3"] | None = eqx.field(init=False, metadata=made_by("graded"))
-    gaps: UInt8[Array, "x y z"] | None
-    remainder: Remainder
-    unit: str = eqx.field(static=True)
-    missing: float | int | None = eqx.field(static=True)
+    gaps: UInt8[Array, "x y z"] | None = parameter(doc="which voxels are missing")
+    remainder: Remainder = parameter(doc="what single precision leaves of world_from_grid")
+    unit: str = choice(doc="of the data, such as HU")
+    missing: float | int | None = choice(doc="stored number that means that there are no data")
 
     def __init__(
         self,
@@ -137,8 +138,6 @@ class Volume(AbstractPart):
         gaps: ArrayLike | None = None,
     ):
         masked, missing = masked_voxels(values), as_missing(missing)
-        if not isinstance(interpolation, AbstractInterpolation):
-            raise TypeError(f"interpolation must be jvr.Trilinear() or jvr.Nearest(), not {interpolation!r}")
         values = in_memory(values)
         if values.ndim != 3 or values.size == 0:
             thick = (
@@ -159,11 +158,8 @@ class Volume(AbstractPart):
         world_from_grid = jnp.eye(4) if world_from_grid is None else world_from_grid
         self.world_from_grid = affine(world_from_grid, "world_from_grid")
         self.remainder = Remainder.left(world_from_grid, self.world_from_grid, remainder)
-        self.slope = float_array(slope, "slope", ())
-        self.intercept = float_array(intercept, "intercept", ())
-        require(self.slope, lambda x: np.isfinite(x) & (x != 0), f"slope must be finite and not 0, not {slope}")
-        require(self.intercept, np.isfinite, f"intercept must be finite, not {intercept}")
-        self.interpolation = interpolation
+        assign(self, slope=slope, intercept=intercept, interpolation=interpolation)
+        require(self.slope, lambda x: x != 0, "slope must be finite and not 0")
         self.unit = unit
         # Without gaps it says nothing, and would be a reason to compile anew.
         self.missing = None if self.gaps is None else missing

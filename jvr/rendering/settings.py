@@ -1,13 +1,12 @@
 """How a scene is rendered: everything that changes time and accuracy, and nothing that changes the scene."""
 
-import math
 from typing import Any
-
-import equinox as eqx
 
 from jvr.march.differentiation import AbstractAdjoint, Replay
 from jvr.march.quadrature import AbstractQuadrature, Midpoint, PreIntegrated
+from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import AbstractPart, Knob, PlanEntry
+from jvr.model.ranges import AT_LEAST_ONE, POSITIVE, TRANSMITTANCE
 from jvr.rendering.sampling import AbstractSampling, Uniform
 
 # Values of its knobs, the coarsest first.
@@ -40,14 +39,14 @@ class Settings(AbstractPart):
     **Raises** `ValueError` for values out of range.
     """
 
-    step: float = eqx.field(static=True)
-    termination: float = eqx.field(static=True)
-    quadrature: AbstractQuadrature
-    skipping: bool = eqx.field(static=True)
-    negligible: float = eqx.field(static=True)
-    adjoint: AbstractAdjoint
-    sampling: AbstractSampling
-    tile: int = eqx.field(static=True)
+    step: float = choice(POSITIVE, doc="length of a step", unit="voxels of the smallest spacing", hint="0.5 is a good start")
+    termination: float = choice(TRANSMITTANCE, doc="transmittance at which a ray ends", hint="0 never ends one early")
+    quadrature: AbstractQuadrature = parameter(doc="jvr.Midpoint() or jvr.PreIntegrated()")
+    skipping: bool = choice(doc="whether empty bricks are skipped")
+    negligible: float = choice(TRANSMITTANCE, doc="optical depth that a ray may leave out", hint="1e-3 changes no 8-bit picture")
+    adjoint: AbstractAdjoint = parameter(doc="jvr.Replay(), jvr.Forward() or jvr.Rows()")
+    sampling: AbstractSampling = parameter(doc="jvr.Uniform(), jvr.Refinement() or jvr.Slices()")
+    tile: int = choice(AT_LEAST_ONE, doc="rays at a time")
 
     def __init__(
         self,
@@ -61,34 +60,12 @@ class Settings(AbstractPart):
         sampling: AbstractSampling = Uniform(),
         tile: int = 262_144,
     ):
-        if isinstance(step, bool) or not isinstance(step, int | float) or not (math.isfinite(step) and step > 0):
-            raise ValueError(f"step must be a positive number of voxels, not {step!r}; 0.5 is a good start")
-        if not isinstance(termination, int | float) or not 0 <= termination < 1:
-            raise ValueError(f"termination must be a transmittance in [0, 1), not {termination!r}; 0 never ends a ray early")
-        if not isinstance(quadrature, AbstractQuadrature):
-            raise TypeError(f"quadrature must be jvr.Midpoint() or jvr.PreIntegrated(), not {quadrature!r}")
-        if not isinstance(skipping, bool):
-            raise TypeError(f"skipping must be True or False, not {skipping!r}")
-        if isinstance(negligible, bool) or not isinstance(negligible, int | float) or not 0 <= negligible < 1:
-            raise ValueError(f"negligible must be an optical depth in [0, 1), not {negligible!r}; 1e-3 changes no 8-bit picture")
+        assign(self, step=step, termination=termination, quadrature=quadrature, skipping=skipping)
+        assign(self, negligible=negligible, adjoint=adjoint, sampling=sampling, tile=tile)
         if negligible and not skipping:
             raise ValueError("negligible bricks can only be left out with skipping=True")
         if negligible and not isinstance(quadrature, Midpoint):
             raise ValueError("what is negligible is left out by midpoints: set quadrature=jvr.Midpoint()")
-        if isinstance(tile, bool) or not isinstance(tile, int) or tile < 1:
-            raise ValueError(f"tile must be a positive number of rays, not {tile!r}")
-        if not isinstance(adjoint, AbstractAdjoint):
-            raise TypeError(f"adjoint must be jvr.Replay(), jvr.Forward() or jvr.Rows(), not {adjoint!r}")
-        if not isinstance(sampling, AbstractSampling):
-            raise TypeError(f"sampling must be jvr.Uniform(), jvr.Refinement() or jvr.Slices(), not {sampling!r}")
-        self.step = float(step)
-        self.termination = float(termination)
-        self.quadrature = quadrature
-        self.skipping = skipping
-        self.negligible = float(negligible)
-        self.adjoint = adjoint
-        self.sampling = sampling
-        self.tile = tile
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         absorbs, ends = scene.optical.absorbs, self.termination > 0
