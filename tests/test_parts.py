@@ -8,9 +8,9 @@ import pytest
 from scenes import OBLIQUE, linear_transfer, voxels
 
 import jvr
-from jvr.model.parts import multiples, parts_of, with_part
+from jvr.model.parts import Knob, multiples, parts_of, with_part
 
-LOOPS = [Path(jvr.__file__).parent / "rendering" / f"{name}.py" for name in ("plan", "advise")]
+LOOPS = [Path(jvr.__file__).parent / "rendering" / f"{name}.py" for name in ("plan", "advise", "tune", "foretelling")]
 # The parts that have knobs, each as coarse as it makes sense to begin with.
 PARTS = {
     "shadows": (
@@ -77,9 +77,9 @@ def test_settings_have_knobs_that_fit_the_scene():
 
 
 def test_multiples_stay_in_range():
-    assert multiples("n", 3, (1 / 4, 1 / 2, 1), 4, least=2) == ("n", (2, 3), 12)
+    assert multiples("n", 3, (1 / 4, 1 / 2, 1), 4, least=2) == Knob("n", (2, 3), 12)
     knob = multiples("x", 0.5, (1 / 2, 1, 2, 4), 8, most=1.0)
-    assert knob == ("x", (0.25, 0.5, 1.0), 1.0)
+    assert knob == Knob("x", (0.25, 0.5, 1.0), 1.0)
     assert [knob.coarser(v) for v in (0.25, 0.5, 0.3)] == [None, 0.25, 0.25]
 
 

@@ -50,6 +50,18 @@ def moving(base, camera, what):
     return base.transfer, lambda t: (dataclasses.replace(base, transfer=t), camera)
 
 
+def test_another_step_compiles_nothing():
+    """Of a picture that is not part of somebody's program; it is the one of that step."""
+    base, camera = scene(), perspective(jvr.Volume(voxels(), None))
+    jvr.render(base, camera, jvr.Settings(0.5))
+    before = len(compilations)
+    coarse = jvr.render(base, camera, jvr.Settings(2.0))
+    assert len(compilations) == before
+    fresh = compiled(lambda s, c: jvr.render(s, c, jvr.Settings(2.0)))(base, camera)
+    np.testing.assert_allclose(coarse.rgb, fresh.rgb, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(coarse.stats.steps, fresh.stats.steps)
+
+
 @pytest.mark.parametrize(
     ("case", "what"),
     [

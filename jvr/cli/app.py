@@ -200,10 +200,13 @@ def tune(
         check_file_output(output, "tuned.toml")
         check_inputs_stay(output, inputs_of(config))
     report = tune_settings(config, output, error, seconds)
-    settings, lines = report["settings"], lines_of(report["precomputed"])
+    lines = lines_of(report["precomputed"])
     for name in ("predicted", "measured"):
         lines.append(f"{name + ':':<11}RMSE {report[name]['rmse']:.2e}, {1e3 * report[name]['seconds']:.0f} ms")
-    lines.append(f"step {settings['step']:g}, termination {settings['termination']:g}, {settings['quadrature']}: {output}")
+    said = lambda value: f"{value:g}" if isinstance(value, float) else str(value)
+    for table, values in report["tables"].items():
+        lines.append(f"[{table}]  " + ", ".join(f"{key} = {said(value)}" for key, value in values.items()))
+    lines.append(f"written to {output}")
     _print(report, as_json, "\n".join(lines))
 
 

@@ -1,4 +1,4 @@
-"""`jvr tune`: the cheapest settings for a wanted error, or the most accurate ones for a wanted time."""
+"""`jvr tune`: the cheapest choices for a wanted error, or the most accurate ones for a wanted time."""
 
 import re
 import time
@@ -11,16 +11,17 @@ from jvr.cli.beforehand import Beforehand
 from jvr.cli.inputs import BadInput, reading
 from jvr.cli.runtime import progress, provenance, start_jax
 from jvr.io.config import Config, build_cameras, build_scene
-from jvr.march.quadrature import PreIntegrated
+from jvr.io.config.build import QUADRATURES
+from jvr.io.kinds import KINDS
+from jvr.model.scene import Scene
+from jvr.rendering.foretelling import turns_of
 from jvr.rendering.measure import Measurement
 from jvr.rendering.settings import Settings
 from jvr.rendering.tune import tune
 
-KEYS = ("step", "termination", "quadrature")
-
 
 def tune_settings(config: Config, output: Path, error: float | None, seconds: float | None) -> dict[str, Any]:
-    """Finds settings for the first camera of a configuration and writes a copy of it with them.
+    """Finds settings, and what the scene's own knobs should be, for the first camera of a configuration, and writes a copy with them.
 
     **Raises** `BadInput` where nothing meets the target, with what can be met; nothing is written then.
     """
@@ -30,7 +31,8 @@ def tune_settings(config: Config, output: Path, error: float | None, seconds: fl
     with reading():
         scene = build_scene(config)
         camera = build_cameras(config, scene.volume)[0]
-        with_settings(config.text, Settings())
+        # Before minutes of measurements: whether what is found can be written.
+        with_tables(config.text, _untouched(scene))
         scene = beforehand(scene)
     with progress("measuring"), reading():
         found = tune(scene, camera, error=error, seconds=seconds)
@@ -42,45 +44,85 @@ def tune_settings(config: Config, output: Path, error: float | None, seconds: fl
         raise BadInput(
             f"--time {seconds:g} is out of reach on this scene: the least that was reached is {found.measured.seconds:.2g} s"
         )
+    tables = tables_of(found.turned)
+    if not config.tables.settings.skipping:
+        # Measured with skipping, without which nothing can be negligible.
+        tables["settings"]["skipping"] = True
     with replacing(output) as temporary:
-        temporary.write_text(with_settings(config.text, found.settings), encoding="utf-8")
+        temporary.write_text(with_tables(config.text, tables), encoding="utf-8")
     return {
         "command": "tune",
         "config": config.name,
         "output": str(output),
-        "settings": _named(found.settings),
+        "tables": tables,
+        "settings": tables["settings"],
         "predicted": _numbers(found.predicted),
         "measured": _numbers(found.measured),
-        "candidates": [{**_named(m.settings), **_numbers(m)} for m in found.candidates],
+        "candidates": [_numbers(m) for m in found.candidates],
         "precomputed": beforehand.report,
         "seconds": time.perf_counter() - began,
         **provenance(),
     }
 
 
-def with_settings(text: str, settings: Settings) -> str:
-    """A configuration with other values of `KEYS` in its table `[settings]`; the rest stays as it was written.
+def with_tables(text: str, tables: dict[str, dict[str, Any]]) -> str:
+    """A configuration with other values of some keys of its tables; the rest stays as it was written. What is a name alone, such as
+    `shadows = "volume"`, becomes a table; a table that is not there is added.
 
-    **Raises** `ValueError` where the settings are not a table of their own.
+    **Raises** `ValueError` where one is written in a line of its own, so that its keys cannot be replaced.
     """
-    values = [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value:g}" for key, value in _named(settings).items()]
-    header = re.search(r"^\s*\[settings\][^\n]*$", text, re.MULTILINE)
+    for name, values in tables.items():
+        text = _with_table(text, name, {key: _toml(value) for key, value in values.items()})
+    return text
+
+
+def _with_table(text: str, name: str, values: dict[str, str]) -> str:
+    lines = [f"{key} = {value}" for key, value in values.items()]
+    header = re.search(rf"^\s*\[{name}\][^\n]*$", text, re.MULTILINE)
     if header is None:
-        if "settings" in tomllib.loads(text):
-            raise ValueError(
-                "settings: write them as a table, with a line [settings] above its keys, so that they can be replaced"
-            )
-        return text.rstrip("\n") + "\n\n[settings]\n" + "\n".join(values) + "\n"
+        held = tomllib.loads(text).get(name)
+        if held is None:
+            return text.rstrip("\n") + f"\n\n[{name}]\n" + "\n".join(lines) + "\n"
+        if not isinstance(held, str):
+            raise ValueError(f"{name}: write it as a table, with a line [{name}] above its keys, so that they can be replaced")
+        named = {"kind": _toml(held)} | values
+        inline = f"{name} = {{ {', '.join(f'{key} = {value}' for key, value in named.items())} }}"
+        return re.sub(rf"^\s*{name}\s*=[^\n]*$", inline, text, count=1, flags=re.MULTILINE)
     rest = text[header.end() :]
     following = re.search(r"^\s*\[", rest, re.MULTILINE)
     inside = rest if following is None else rest[: following.start()]
-    kept = re.sub(rf"^\s*({'|'.join(KEYS)})\s*=[^\n]*\n?", "", inside, flags=re.MULTILINE)
-    return text[: header.end()] + "\n" + "\n".join(values) + "\n" + kept.lstrip("\n") + rest[len(inside) :]
+    kept = re.sub(rf"^\s*({'|'.join(values)})\s*=[^\n]*\n?", "", inside, flags=re.MULTILINE)
+    return text[: header.end()] + "\n" + "\n".join(lines) + "\n" + kept.lstrip("\n") + rest[len(inside) :]
 
 
-def _named(settings: Settings) -> dict[str, Any]:
-    quadrature = "pre-integrated" if isinstance(settings.quadrature, PreIntegrated) else "midpoint"
-    return {"step": settings.step, "termination": settings.termination, "quadrature": quadrature}
+def tables_of(choice: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What was chosen for each knob, by the tables and keys of a configuration."""
+    tables: dict[str, dict[str, Any]] = {"settings": {}}
+    for name, value in choice.items():
+        place, _, key = name.rpartition(".")
+        kind = _kind(value)
+        # A part that is a choice as a whole is known by its kind.
+        key, value = ("kind" if place and kind else key), kind or value
+        tables.setdefault(place.replace(" ", "_") or "settings", {})[key] = value
+    return tables
+
+
+def _kind(value: Any) -> str | None:
+    """What a configuration calls an object, or `None` for what is none."""
+    named = [(cls.__name__, kind) for kind, cls in QUADRATURES.items()]
+    named += [(name, kind) for family, kinds in KINDS.items() if isinstance(value, family) for kind, name in kinds.items()]
+    return dict(named).get(type(value).__name__)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, str):
+        return f'"{value}"'
+    return str(value).lower() if isinstance(value, bool) else f"{value:.9g}"
+
+
+def _untouched(scene: Scene) -> dict[str, dict[str, Any]]:
+    """The tables that may be written, with the first value of each knob."""
+    return tables_of({turn.name: turn.knob.values[0] for turn in turns_of(scene, Settings(), 1.0)})
 
 
 def _numbers(m: Measurement) -> dict[str, float]:

@@ -248,7 +248,7 @@ def observed_medium(
 ) -> tuple[Medium, Rays]:
     """What the rays of a tile march through, resampled anew or from kept samples, and the rays inside of it."""
     rays = _inside(scene, tile.rays)
-    through = medium(near_volume(scene)[0], settings, *prepared)
+    through = medium(near_volume(scene)[0], settings, prepared)
     if samples is not None:
         through = through._replace(field=samples.along(tile.start))
     return through, rays

@@ -25,12 +25,17 @@ class PlanEntry(NamedTuple):
 
 
 class Knob(NamedTuple):
-    """A static choice that trades accuracy for time: the field that it sets, the values to try, the coarsest first, and one that is at
-    least as fine as all of them, for the picture that errors are measured against."""
+    """A static choice that trades accuracy for time.
+
+    `name`: of the field that it sets; `values`: to try, the coarsest first; `reference`: at least as fine as all of them, for the picture
+    that errors are measured against; `bounds_error`: a value bounds the error, in units of the brightest radiance, so that it need not
+    be searched for.
+    """
 
     name: str
     values: tuple[Any, ...]
     reference: Any
+    bounds_error: bool = False
 
     def coarser(self, value: Any) -> Any:
         """The next coarser value, or `None` where there is none; of a number that is none of them, too."""

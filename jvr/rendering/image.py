@@ -16,7 +16,7 @@ from jvr.model.scene import Scene
 from jvr.rendering.sampling import RefinementStats, SliceStats
 from jvr.rendering.settings import Settings
 from jvr.rendering.trace import Pixels, Prepared, prepare, resolve, trace
-from jvr.types import Image
+from jvr.types import Image, Scalar
 
 
 class RenderStats(eqx.Module):
@@ -85,20 +85,22 @@ def render_uniform(scene: Scene, camera: AbstractCamera, settings: Settings) -> 
     if is_traced() and not is_spread():
         # A part of somebody's program, in which arrays that it closes over are constants.
         return _render(scene, camera, settings)
+    # The step is an argument of the program: with another one nothing is compiled again.
+    same = dataclasses.replace(settings, step=1.0)
     if is_traced((scene, camera)) or is_spread():
         # Inside of `jax.grad`, `jax.vmap` or `jax.shard_map` alone: they take a compiled program as a single operation.
-        return _picture(scene, camera, settings)
-    return within_memory(lambda tile: _picture(scene, camera, dataclasses.replace(settings, tile=tile)), settings.tile)
+        return _picture(scene, camera, same, settings.step)
+    return within_memory(lambda tile: _picture(scene, camera, dataclasses.replace(same, tile=tile), settings.step), settings.tile)
 
 
-def _render(scene: Scene, camera: AbstractCamera, settings: Settings) -> Rendering:
+def _render(scene: Scene, camera: AbstractCamera, settings: Settings, step: Scalar | float | None = None) -> Rendering:
     height, width = camera.height, camera.width
     most = settings.tile // math.prod(block_shape(height, width))
 
     def share(shared: tuple[Scene, AbstractCamera, Prepared], blocks: Int[Array, "blocks"]) -> tuple[Pixels, Int[Array, "rays"]]:
         return in_tiles(lambda tile: _render_blocks(*shared, settings, tile), blocks, most)
 
-    prepared, dealt = prepare(scene, settings), dealt_blocks(height, width, shares())
+    prepared, dealt = prepare(scene, settings, step), dealt_blocks(height, width, shares())
     rays = everywhere(over_rays(share, (scene, camera, prepared), dealt))
     (rgb, alpha, depth), steps = picture_of(rays, height, width, shares())
     return Rendering(rgb, alpha, depth, RenderStats(steps, shadows=everywhere(prepared.shadow_stats)))

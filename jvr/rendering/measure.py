@@ -4,7 +4,7 @@ import dataclasses
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,10 +16,7 @@ from jvr.march.differentiation import Replay
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import render
-from jvr.rendering.settings import Settings
-
-# Segments of the reference for each of the finest setting's.
-FINER = 4
+from jvr.rendering.settings import FINER, Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,20 +58,47 @@ def measure(
     if not settings:
         raise ValueError("measure needs at least one jvr.Settings to compare with the reference")
     step = min(s.step for s in settings) / FINER if reference_step is None else reference_step
-    truth = _reference(scene, camera, Settings(step, termination=0.0, skipping=False), unknowns)
+    truth = reference(scene, camera, Settings(step, termination=0.0, skipping=False), unknowns)
+    timed = timed_pictures([(scene, one) for one in settings], camera, unknowns, repeats=repeats)
+    return tuple(compared(truth, one, picture) for one, picture in zip(settings, timed, strict=True))
+
+
+class TimedPicture(NamedTuple):
+    """A picture, the number of its samples, its gradient (or `None`), the median and the least of its times, and that of compiling it."""
+
+    rgb: np.ndarray
+    samples: int
+    gradient: Any
+    seconds: float
+    least_seconds: float
+    compile_seconds: float
+
+
+def timed_pictures(
+    variants: Sequence[tuple[Scene, Settings]],
+    camera: AbstractCamera,
+    unknowns: Callable[[Scene], Any] | None = None,
+    *,
+    repeats: int = 5,
+) -> list[TimedPicture]:
+    """The pictures of several scenes under their settings, timed in turns, so that a slow moment of the machine hits all alike."""
     first, images = [], []
-    for one in settings:
+    for scene, settings in variants:
         began = time.perf_counter()
-        images.append(jax.block_until_ready(_picture(scene, camera, one, unknowns)))
+        rgb, samples, gradient = jax.block_until_ready(_picture(scene, camera, settings, unknowns))
         first.append(time.perf_counter() - began)
-    times: list[list[float]] = [[] for _ in settings]
+        images.append((np.asarray(rgb), int(samples), gradient))
+    times: list[list[float]] = [[] for _ in variants]
     for _ in range(repeats):
-        for one, seconds in zip(settings, times, strict=True):
+        for (scene, settings), seconds in zip(variants, times, strict=True):
             began = time.perf_counter()
-            jax.block_until_ready(_picture(scene, camera, one, unknowns))
+            jax.block_until_ready(_picture(scene, camera, settings, unknowns))
             seconds.append(time.perf_counter() - began)
-    rows = zip(settings, map(statistics.median, times), first, images, strict=True)
-    return tuple(_compare(truth, s, median, once - median, image) for s, median, once, image in rows)
+    found = []
+    for (rgb, samples, gradient), some, once in zip(images, times, first, strict=True):
+        median = statistics.median(some)
+        found.append(TimedPicture(rgb, samples, gradient, median, min(some), max(once - median, 0.0)))
+    return found
 
 
 def _picture(
@@ -100,8 +124,10 @@ def _brightness(unknown: Scene, known: Scene, camera: AbstractCamera, settings: 
 _with_gradient = jax.jit(jax.value_and_grad(_brightness, has_aux=True), static_argnums=3)
 
 
-def _reference(scene: Scene, camera: AbstractCamera, settings: Settings, unknowns: Callable[[Scene], Any] | None) -> Any:
-    """Picture and gradient in double precision."""
+def reference(
+    scene: Scene, camera: AbstractCamera, settings: Settings, unknowns: Callable[[Scene], Any] | None = None
+) -> tuple[np.ndarray, Any]:
+    """Picture and gradient (or `None`) in double precision."""
     double = lambda x: jnp.asarray(np.asarray(x, np.float64)) if eqx.is_inexact_array(x) else x
     with jax.enable_x64(True):
         scene, camera = jax.tree.map(double, (scene, camera))
@@ -126,9 +152,10 @@ def similarity(true: np.ndarray, found: np.ndarray, bright: float = 1.0) -> floa
     return float(ssim)
 
 
-def _compare(truth: Any, settings: Settings, seconds: float, compile_seconds: float, found: Any) -> Measurement:
-    (true_rgb, true_gradient), (rgb, samples, gradient) = truth, found
-    rgb = np.asarray(rgb, np.float64)
+def compared(truth: tuple[np.ndarray, Any], settings: Settings, found: TimedPicture) -> Measurement:
+    """A picture, and its gradient where it has one, beside the `reference`."""
+    (true_rgb, true_gradient), gradient = truth, found.gradient
+    rgb = np.asarray(found.rgb, np.float64)
     difference = rgb - true_rgb
     bright = max(float(true_rgb.max() - true_rgb.min()), np.finfo(float).tiny)
     error = None
@@ -136,6 +163,5 @@ def _compare(truth: Any, settings: Settings, seconds: float, compile_seconds: fl
         flat = lambda tree: np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in jax.tree.leaves(tree)])
         error = float(np.linalg.norm(flat(gradient) - flat(true_gradient)) / np.linalg.norm(flat(true_gradient)))
     rmse, largest = float(np.sqrt(np.mean(difference**2))), float(np.abs(difference).max())
-    return Measurement(
-        settings, seconds, max(compile_seconds, 0.0), int(samples), rmse, largest, similarity(true_rgb, rgb, bright), error
-    )
+    ssim = similarity(true_rgb, rgb, bright)
+    return Measurement(settings, found.seconds, found.compile_seconds, found.samples, rmse, largest, ssim, error)

@@ -4,7 +4,7 @@ Modules of effects are imported here and only for scenes that hold them; everyth
 `jvr.model.effects`.
 """
 
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -23,29 +23,38 @@ from jvr.model.optical import AbsorptionOnly
 from jvr.model.preintegration import PreIntegratedTable
 from jvr.model.scene import Scene
 from jvr.rendering.settings import Settings
+from jvr.types import Scalar
 
 
-def medium(
-    scene: Scene,
-    settings: Settings,
-    occupancy: Occupancy | None = None,
-    shadows: AbstractVisibility | None = None,
-    environment: Any = None,
-) -> Medium:
-    """What of a scene rays march through: what the scene does not name is not in it. The last three are those of `Prepared`."""
+class Prepared(NamedTuple):
+    """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under
+    environment lighting, each `None` where the scene asks for none; and the length of a segment, that of the settings for `None`."""
+
+    occupancy: Occupancy | None = None
+    shadows: AbstractVisibility | None = None
+    environment: Any = None
+    dt: Scalar | None = None
+
+    @property
+    def shadow_stats(self) -> Any:
+        return None if self.shadows is None else self.shadows.stats
+
+
+def medium(scene: Scene, settings: Settings, prepared: Prepared = Prepared()) -> Medium:
+    """What of a scene rays march through: what the scene does not name is not in it."""
     frame, normals = _gradients(scene)
     field = VoxelField(scene.volume, normals)
     quadrature = settings.quadrature
     pre_integrated = quadrature.pre_integrates
     if scene.shows_light:
-        shader = _lit_shader(scene, frame, pre_integrated, environment)
+        shader = _lit_shader(scene, frame, pre_integrated, prepared.environment)
     else:
         shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
     if not isinstance(quadrature, PreIntegrated):
-        return Medium(field, scene.transfer, shader, occupancy, shadows)
+        return Medium(field, scene.transfer, shader, prepared.occupancy, prepared.shadows)
     # Checks the transfer function's type itself.
     table = PreIntegratedTable(cast(Any, scene.transfer), quadrature.parts)
-    return Medium(field, table, shader, occupancy, shadows)
+    return Medium(field, table, shader, prepared.occupancy, prepared.shadows)
 
 
 def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool, environment: Any) -> AbstractShader:

@@ -96,7 +96,7 @@ def _trace(
     # A ray without length is not marched.
     rays = rays._replace(length=jnp.where(mask, rays.length, 0.0))
     options = MarchOptions(settings.termination, True)
-    gathered = settings.adjoint.march(options, medium(scene, settings, *prepared), rays, step_length(scene, settings))
+    gathered = settings.adjoint.march(options, medium(scene, settings, prepared), rays, step_length(scene, settings))
     rgb, alpha = composite(scene, gathered, rays.length)
     weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
     assert gathered.steps is not None

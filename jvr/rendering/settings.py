@@ -11,8 +11,8 @@ from jvr.rendering.sampling import AbstractSampling, Uniform
 
 # Values of its knobs, the coarsest first.
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
-TERMINATIONS = (1e-2, 1e-4)
-NEGLIGIBLE = (1e-2, 1e-3, 0.0)
+TERMINATIONS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+NEGLIGIBLE = (1e-2, 0.0)
 # Segments of a reference for each of the finest setting's.
 FINER = 4
 
@@ -86,7 +86,7 @@ class Settings(AbstractPart):
 
     def knobs(self, scene: Any) -> tuple[Knob, ...]:
         quadratures = tuple(rule for rule in (Midpoint(), PreIntegrated()) if rule.integrates(scene.transfer))
-        termination = (Knob("termination", TERMINATIONS, 0.0),) if scene.optical.absorbs else ()
+        termination = (Knob("termination", TERMINATIONS, 0.0, bounds_error=True),) if scene.optical.absorbs else ()
         return (
             Knob("step", STEPS, STEPS[-1] / FINER),
             Knob("quadrature", quadratures, Midpoint()),

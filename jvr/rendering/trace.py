@@ -8,14 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jvr.march.march import Marched, MarchOptions
-from jvr.march.medium import AbstractVisibility, Medium
-from jvr.march.occupancy import Occupancy
+from jvr.march.medium import Medium
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero, larger, one_minus_exp, ray_box, smaller
-from jvr.rendering.medium import environment, medium, occupancy, visibility
+from jvr.rendering.medium import Prepared, environment, medium, occupancy, visibility
 from jvr.rendering.settings import Settings
 from jvr.types import Scalar, Triple
 
@@ -23,24 +22,13 @@ from jvr.types import Scalar, Triple
 FAR = 2.0
 
 
-class Prepared(NamedTuple):
-    """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under
-    environment lighting; each `None` where the scene asks for none."""
-
-    occupancy: Occupancy | None = None
-    shadows: AbstractVisibility | None = None
-    environment: Any = None
-
-    @property
-    def shadow_stats(self) -> Any:
-        return None if self.shadows is None else self.shadows.stats
-
-
-def prepare(scene: Scene, settings: Settings) -> Prepared:
-    """What rays through a scene need to know beforehand, computed once."""
+def prepare(scene: Scene, settings: Settings, step: Scalar | float | None = None) -> Prepared:
+    """What rays through a scene need to know beforehand, computed once. `step`: in place of that of the settings; traced, one
+    program serves all steps."""
     (scene,) = near_volume(scene)
     occupied = occupancy(scene, settings)
-    return Prepared(occupied, visibility(scene, occupied), environment(scene))
+    dt = None if step is None else step * jnp.min(scene.volume.spacing)
+    return Prepared(occupied, visibility(scene, occupied), environment(scene), dt)
 
 
 def trace(
@@ -72,7 +60,9 @@ def camera_rays(
     """The rays of some pixels before they are marched, and the distance from the eye to their entry."""
     scene, camera = near_volume(scene, camera)
     rays, t_in = enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)))
-    return CameraRays(medium(scene, settings, *prepared), rays, step_length(scene, settings)), t_in
+    return CameraRays(
+        medium(scene, settings, prepared), rays, step_length(scene, settings) if prepared.dt is None else prepared.dt
+    ), t_in
 
 
 def promote_dtypes(scene: Scene, *others: Any) -> Any:
