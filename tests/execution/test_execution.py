@@ -19,6 +19,9 @@ import jvr
 from jvr.execution import tiles
 from jvr.march.differentiation import AbstractAdjoint
 
+# They run in processes of their own.
+SCRIPTS = Path(__file__).parents[1]
+
 
 def scene_of(seed, dtype=np.uint8, shape=(9, 7, 8)):
     values = np.random.default_rng(seed).integers(0, 256, shape).astype(dtype)
@@ -135,7 +138,7 @@ def test_cores_are_asked_for_too_late(monkeypatch):
 @pytest.mark.parametrize("which", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
 def test_rays_over_three_devices(which):
     """The cases of `devices.py`, in a process whose processor is three devices."""
-    cases = Path(__file__).with_name("devices.py")
+    cases = SCRIPTS / "devices.py"
     flags = ["-q", "-x", "-m", which, "-p", "no:cacheprovider", "-p", "no:xdist"]
     environment = os.environ | {"JVR_TEST_DEVICES": "3"}
     ran = subprocess.run(
@@ -150,7 +153,7 @@ def test_two_processes_make_what_one_does(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    script, files = Path(__file__).with_name("processes.py"), [tmp_path / f"{name}.npz" for name in ("alone", "first", "second")]
+    script, files = SCRIPTS / "processes.py", [tmp_path / f"{name}.npz" for name in ("alone", "first", "second")]
     arguments = [("1", "0"), ("2", "0"), ("2", "1")]
     started = [
         subprocess.Popen([sys.executable, script, *numbers, address, file], stderr=subprocess.PIPE, text=True)
@@ -176,7 +179,7 @@ def test_two_processes_make_what_one_does(tmp_path):
 def test_a_device_waits_for_another_one(patience, seconds):
     """The compiler's own choice ends the process 40 seconds after a warning, here the first second. That what is set from Python counts is
     seen where it is set to less. (Seconds are estimated, and may be fewer where other processes come to rest.)"""
-    command = [sys.executable, Path(__file__).with_name("patience.py"), str(patience), str(seconds)]
+    command = [sys.executable, SCRIPTS / "patience.py", str(patience), str(seconds)]
     environment = os.environ | {"XLA_FLAGS": "--xla_cpu_collective_call_warn_stuck_timeout_seconds=1"}
     ran = subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)
     if patience < seconds:
@@ -197,7 +200,7 @@ def test_functions_of_scenes_are_exported_to_another_process(tmp_path):
     }
     for name, function in functions.items():
         (tmp_path / name).write_bytes(export.export(function)(scene).serialize())
-    command = [sys.executable, Path(__file__).with_name("exported.py"), tmp_path]
+    command = [sys.executable, SCRIPTS / "exported.py", tmp_path]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert ran.returncode == 0, ran.stderr[-4000:]
     called, picture = np.load(tmp_path / "called.npz"), functions["picture"](scene)

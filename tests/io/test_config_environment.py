@@ -210,7 +210,7 @@ def test_a_volume_keeps_the_gradients_that_a_material_asks_for():
     ],
 )
 def test_mistakes_about_environment_lighting_are_named(change, key, hint):
-    line = refusal(build_scene, ENVIRONMENT, change.replace("PROJECT", str(Path(__file__).parents[1] / "pyproject.toml")))
+    line = refusal(build_scene, ENVIRONMENT, change.replace("PROJECT", str(Path(__file__).parents[2] / "pyproject.toml")))
     assert f"{key}: " in line
     assert hint in line
 
@@ -325,5 +325,5 @@ def test_a_white_furnace_is_white():
 def test_the_configurations_are_valid(name, request, monkeypatch):
     if name.startswith("real"):
         monkeypatch.setenv("JVR_DATA", str(request.getfixturevalue("data")))
-    made = build_scene(read_config(Path(__file__).parents[1] / "configs" / name))
+    made = build_scene(read_config(Path(__file__).parents[2] / "configs" / name))
     assert made.radiance_transfer is not None

@@ -307,7 +307,7 @@ def test_the_installed_command_starts_and_refuses(tmp_path):
 def test_an_installed_wheel_has_the_demo(tmp_path):
     """`jvr demo` needs no repository: the wheel, unpacked elsewhere, finds its configuration in itself."""
     pytest.importorskip("setuptools", reason="builds a wheel without the network")
-    repository, source, installed = Path(__file__).parents[1], tmp_path / "source", tmp_path / "installed"
+    repository, source, installed = Path(__file__).parents[2], tmp_path / "source", tmp_path / "installed"
     source.mkdir()
     for folder in ("jvr", "configs"):
         shutil.copytree(repository / folder, source / folder)

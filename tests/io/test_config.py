@@ -22,7 +22,7 @@ from jvr.io.config import (
 )
 from jvr.rendering.trace import enter
 
-CONFIGS = Path(__file__).parents[1] / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 BASE = '[volume]\nbuiltin = "demo"\n[transfer]\nkind = "window"\n'
 LINEAR = "transfer={kind='linear',positions=[0,1],rgb=[[1,1,1],[1,1,1]],sigma_t=[1,2]}"
 

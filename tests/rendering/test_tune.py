@@ -135,7 +135,7 @@ def test_one_target_is_asked_for():
 def test_command(tmp_path, monkeypatch):
     monkeypatch.setenv("JVR_CACHE", "0")
     monkeypatch.setattr(settings, "STEPS", (2.0,))
-    given, output = Path(__file__).parents[1] / "configs" / "demo.toml", tmp_path / "tuned.toml"
+    given, output = Path(__file__).parents[2] / "configs" / "demo.toml", tmp_path / "tuned.toml"
     command = ["tune", str(given), "-o", str(output), "--set", "camera.width=20", "--set", "camera.height=16"]
     run = lambda *flags: CliRunner().invoke(app, [*command, *flags], catch_exceptions=False)
     with pytest.raises(BadInput, match=r"--time 1e-09 is out of reach on this scene: the least"):

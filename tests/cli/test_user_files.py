@@ -15,9 +15,9 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
+from fits import CAMERAS, IMAGES, TRUTH, VOLUME, both, fit
 from PIL import Image
 from test_cli import FIT, snapshot
-from test_fit import CAMERAS, IMAGES, TRUTH, VOLUME, both, fit
 
 import jvr
 from jvr import cli

@@ -5,6 +5,7 @@ import functools
 import itertools
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -58,7 +59,7 @@ BLOCKED = """
 import sys
 for name in {modules}:
     sys.modules[name] = None  # importing it raises ImportError
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {tests!r}
 from test_effects import program, scene
 print(program(scene()))
 """
@@ -66,9 +67,9 @@ print(program(scene()))
 
 def test_scene_without_effects_needs_none_of_their_modules():
     """The same program when no module of an effect can be imported."""
-    folder = str(__file__).rsplit("/", 1)[0]
+    folders = [str(folder) for folder in Path(__file__).parents[:2]]
     modules = [f"jvr.effects.{name}" for name in MODULES] + [f"jvr.model.{name}" for name in MODELS]
-    code = BLOCKED.format(modules=modules, tests=folder)
+    code = BLOCKED.format(modules=modules, tests=folders)
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, encoding="utf-8")
     assert run.returncode == 0, run.stderr
     # Addresses of functions are the only difference between two processes.
