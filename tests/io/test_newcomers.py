@@ -541,7 +541,7 @@ def test_names_that_are_no_text_are_printed(tmp_path):
         capture_output=True,
     )
     assert done.returncode == 0, done.stderr
-    assert b"\udcff.npy" in done.stdout
+    assert rb"\udcff.npy" in done.stdout
 
 
 def test_what_is_up_is_said_by_what_a_file_holds_not_by_its_name(tmp_path):
