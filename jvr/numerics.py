@@ -4,6 +4,7 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jvr.types import Affine, Corner, Triple
@@ -190,8 +191,12 @@ def materialise(mask: Bool[Array, "..."], x: Tree) -> Tree:
 
     A conditional is the one thing that it does not fuse through (an optimization barrier does not survive it). `mask` has
     an element that is true whenever `x` matters, which the compiler cannot know; where none is, zeros are returned.
+
+    Under `vmap` one element in the whole batch is enough: a condition for each of the batch would make a selection of the conditional,
+    through which the compiler fuses, and where kernels round a position on either side of a voxel, one reads another voxel than those
+    that the weights of the other belong to.
     """
-    return jax.lax.cond(jnp.any(mask), lambda x: x, lambda x: jax.tree.map(jnp.zeros_like, x), x)
+    return jax.lax.cond(unvmap_any(mask), lambda x: x, lambda x: jax.tree.map(jnp.zeros_like, x), x)
 
 
 def read_at(array: Shaped[Array, "n"], index: Int[Array, "..."]) -> Shaped[Array, "..."]:

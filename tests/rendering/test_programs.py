@@ -3,12 +3,13 @@
 import dataclasses
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.monitoring
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import compiled, linear_transfer, perspective, voxels
+from scenes import compiled, linear_transfer, perspective, small, voxels
 
 import jvr
 
@@ -153,3 +154,13 @@ def test_measurements_share_their_programs():
     compilations.clear()
     measure()
     assert not compilations
+
+
+def test_under_vmap_a_sample_on_a_voxel_reads_that_voxel():
+    """The ray in the middle has samples in voxels: the index of a voxel and the weights that go with it come from one position, also where
+    the compiler computes both in kernels of their own."""
+    scene, camera = small(), perspective(small().volume, 9, 5)
+    alpha = lambda rgb: jvr.render(eqx.tree_at(lambda s: s.transfer.rgb, scene, rgb), camera).alpha
+    both = jnp.stack([scene.transfer.rgb, 0.5 * scene.transfer.rgb])
+    one = compiled(alpha)(both[0])
+    np.testing.assert_allclose(compiled(jax.vmap(alpha))(both), jnp.stack([one, one]), atol=2e-6)
