@@ -386,7 +386,7 @@ def test_bad_input_is_named(change, message):
 
 
 def test_integer_voxels_cannot_be_fitted():
-    labels = jvr.Scene(jvr.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3)), _truth())
+    labels = jvr.Scene(jvr.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3)), TRUTH.transfer)
     with pytest.raises(ValueError, match="integer"):
         fit(labels, unknowns=lambda s: s.volume.values)
 
