@@ -1,6 +1,7 @@
 """Decoders in a process of their own: whatever becomes of it is one line about the file."""
 
 import re
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -46,3 +47,33 @@ def test_lzw_pages_of_a_tiff_are_decoded_apart(tmp_path, monkeypatch):
     monkeypatch.setattr(apart, "SCRIPT", tmp_path / "decode.py")
     with pytest.raises(VolumeError, match="status -11"):
         read_volume(tmp_path / "a.tif", spacing=1)
+
+
+def test_lzw_slices_are_decoded_in_one_process(tmp_path, monkeypatch):
+    voxels = np.random.default_rng(0).integers(0, 60, (7, 5, 4), "u2")
+    for k, voxel in enumerate(voxels):
+        tifffile.imwrite(tmp_path / f"slice{k}.tif", voxel, compression="lzw", photometric="minisblack")
+    started, popen = [], subprocess.Popen
+    monkeypatch.setattr(apart.subprocess, "Popen", lambda *a, **b: started.append(popen(*a, **b)) or started[-1])
+    volume = read_volume(tmp_path, spacing=1)
+    np.testing.assert_array_equal(volume.values, voxels.T)
+    assert len(started) == 1
+    assert started[0].returncode is not None
+
+
+def test_a_decoder_goes_on_behind_a_failure(tmp_path, monkeypatch):
+    script = (
+        "import sys\nwhile line := sys.stdin.readline():\n    assert 'bad' not in line\n    print(end='12345678', flush=True)"
+    )
+    (tmp_path / "decode.py").write_text(script)
+    monkeypatch.setattr(apart, "SCRIPT", tmp_path / "decode.py")
+    with apart.Decoder() as decoder:
+        for _ in range(3):
+            assert decoder(Path("a"), {}, 8).tobytes() == b"12345678"
+        with pytest.raises(VolumeError, match="AssertionError"):
+            decoder(Path("b"), {"bad": 1}, 8)
+        assert decoder(Path("c"), {}, 8).tobytes() == b"12345678"
+        decoder._child.kill()
+        decoder._child.wait()
+        with pytest.raises(VolumeError, match="status -9"):
+            decoder(Path("d"), {}, 8)

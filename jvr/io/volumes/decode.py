@@ -1,7 +1,7 @@
 """Decodes what is compressed in a process of its own, with limits of memory and time: the decoders are native code.
 
-Run as a script, without the rest of jvr. Standard input: one line of JSON, the task (`kind`, `bytes` of the largest part and what else
-the kind needs, `seconds`), then the codestreams. Standard output: the numbers, in C order.
+Run as a script, without the rest of jvr. Standard input: tasks, each one line of JSON (`kind`, `bytes` of the largest part and what else
+the kind needs, `seconds`), then its codestreams. Standard output: the numbers of each task, in C order.
 """
 
 import json
@@ -15,9 +15,11 @@ BASE, PER_BYTE = {"streams": 1 << 26, "zarr": 1 << 30, "tiff": 1 << 28}, {"strea
 
 
 def main() -> None:
-    """Does the task of standard input; ends with a message on standard error and status 1 where it cannot."""
-    task = json.loads(sys.stdin.buffer.readline())
-    {"streams": _streams, "zarr": _zarr, "tiff": _tiff}[task["kind"]](task)
+    """Does the tasks of standard input; ends with a message on standard error and status 1 where it cannot."""
+    while line := sys.stdin.buffer.readline():
+        task = json.loads(line)
+        {"streams": _streams, "zarr": _zarr, "tiff": _tiff}[task["kind"]](task)
+        sys.stdout.buffer.flush()
 
 
 def _streams(task: dict) -> None:
@@ -70,7 +72,7 @@ def _tiff(task: dict) -> None:
 
     messages, handler = [], logging.Handler(logging.ERROR)
     handler.emit = lambda record: messages.append(record.getMessage())
-    logging.getLogger("tifffile").addHandler(handler)
+    logging.getLogger("tifffile").handlers = [handler]
     _limit(task)
     try:
         with tifffile.TiffFile(task["file"]) as file:
@@ -80,6 +82,8 @@ def _tiff(task: dict) -> None:
     # A damaged page is logged, and read as if it were black.
     if damage := [message for message in messages if "GDAL_NODATA" not in message]:
         sys.exit(damage[0])
+    if values.nbytes != task["bytes"]:
+        sys.exit(f"its pages hold {values.nbytes:,} bytes, where its header announces {task['bytes']:,}")
     sys.stdout.buffer.write(np.ascontiguousarray(values).view("u1").data)
 
 
@@ -98,9 +102,10 @@ def _limit(task: dict) -> None:
         with open("/proc/self/statm") as file:
             taken = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
         most = taken + BASE[task["kind"]] + PER_BYTE[task["kind"]] * task["bytes"]
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
         used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
-        resource.setrlimit(resource.RLIMIT_CPU, (int(used) + task["seconds"], int(used) + task["seconds"]))
+        for kind, limit in ((resource.RLIMIT_AS, most), (resource.RLIMIT_CPU, int(used) + task["seconds"])):
+            # The hard limit stays for the next task.
+            resource.setrlimit(kind, (limit, resource.getrlimit(kind)[1]))
     except (ImportError, OSError, ValueError):
         # Systems without such limits: the caller's time limit remains.
         pass

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jvr.io.volumes.apart import Decoder
 from jvr.io.volumes.errors import VolumeError, check_size, one_line
 from jvr.io.volumes.given import Given
 from jvr.io.volumes.stored import Stored, affine_of
@@ -43,21 +44,27 @@ def read_slices(path: Path, given: Given) -> Stored:
             path, f"it holds pictures of several kinds, such as {first.name} ({one}) and {second.name} ({other}): keep one kind"
         )
     _say_gaps(path, files)
-    first = _slice(files[0])
+    with Decoder() as decoder:
+        values = _stacked(path, files, decoder)
+    if given.spacing is None:
+        problem = "pictures do not say how far apart voxels and slices are: 1 mm is taken along x, y and z"
+        warnings.warn(f"{path}: {problem}; give spacing= in mm", stacklevel=2)
+    return Stored(values, affine_of(np.ones(3)))
+
+
+def _stacked(path: Path, files: list[Path], decoder: Decoder) -> np.ndarray:
+    first = _slice(files[0], decoder)
     check_size(path, (*first.shape, len(files)), first.dtype.itemsize, None)
     values = np.empty((*first.shape, len(files)), first.dtype, order="F")
     for k, file in enumerate(files):
-        found = _slice(file) if k else first
+        found = _slice(file, decoder) if k else first
         if found.shape != first.shape or found.dtype != first.dtype:
             sizes = [f"{picture.shape[0]} x {picture.shape[1]} {picture.dtype}" for picture in (first, found)]
             raise VolumeError(
                 path, f"its slices differ: {files[0].name} is {sizes[0]}, {file.name} is {sizes[1]}; make them alike"
             )
         values[..., k] = found
-    if given.spacing is None:
-        problem = "pictures do not say how far apart voxels and slices are: 1 mm is taken along x, y and z"
-        warnings.warn(f"{path}: {problem}; give spacing= in mm", stacklevel=2)
-    return Stored(values, affine_of(np.ones(3)))
+    return values
 
 
 def natural(file: Path) -> list[tuple[int, int, str]]:
@@ -94,10 +101,10 @@ def _say_gaps(path: Path, files: list[Path]) -> None:
         warnings.warn(f"{path}: the numbering of its slices has gaps: {where}; they are read as if it had none", stacklevel=3)
 
 
-def _slice(file: Path) -> np.ndarray:
+def _slice(file: Path, decoder: Decoder) -> np.ndarray:
     """One picture as `[x, y]`."""
     if KINDS[file.suffix.lower()] == "TIFF":
-        values = read_tiff(file, Given(spacing=np.ones(3))).values
+        values = read_tiff(file, Given(spacing=np.ones(3)), decoder).values
         if values.shape[2] != 1:
             raise VolumeError(
                 file, f"it holds {values.shape[2]} pages, where a folder's slices hold one each; read it by its own name"

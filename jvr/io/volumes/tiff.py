@@ -5,8 +5,11 @@ import importlib.util
 import logging
 import math
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from jvr.io.volumes.apart import decoded
 from jvr.io.volumes.axes import Chosen, chosen, named
@@ -45,10 +48,11 @@ def _recorded():
         logger.propagate = propagate
 
 
-def read_tiff(path: Path, given: Given) -> Stored:
+def read_tiff(path: Path, given: Given, decoder: Callable[[Path, dict[str, Any], int], np.ndarray] = decoded) -> Stored:
     """A stack of equal grey pages, or the volume that `given.channel` and `given.time` choose of ImageJ's or OME's axes.
 
     `given.array` is the number or name of one of several images; `given.axes` names the axes in place of what the file says.
+    `decoder` is what decodes LZW: a `Decoder`, for many files.
     """
     import tifffile
 
@@ -58,7 +62,7 @@ def read_tiff(path: Path, given: Given) -> Stored:
     with _recorded() as messages:
         try:
             with tifffile.TiffFile(path) as file:
-                stored = _read(path, file, given, messages)
+                stored = _read(path, file, given, decoder, messages)
         except VolumeError:
             raise
         except Exception as error:
@@ -77,7 +81,7 @@ def _refuse_damage(path: Path, messages: list[str]) -> None:
         raise VolumeError(path, f"cut short or damaged: {one_line(damage[0])}; copy or export it again")
 
 
-def _read(path: Path, file: Any, given: Given, messages: list[str]) -> Stored:
+def _read(path: Path, file: Any, given: Given, decoder: Any, messages: list[str]) -> Stored:
     # OME-XML is checked before tifffile parses it.
     images = ome_images(path, file.ome_metadata or "") if file.is_ome else []
     number, series = _series(path, file, images, given, messages)
@@ -85,7 +89,8 @@ def _read(path: Path, file: Any, given: Given, messages: list[str]) -> Stored:
     image = images[number] if len(images) == len(file.series) else None
     names = _axes(path, series, given)
     found = chosen(path, series.shape, names, given, _channels(series, names, image))
-    values = found.of(_apart(path, number, series) if series.keyframe.compression == LZW else series.asarray())
+    packed = series.keyframe.compression == LZW
+    values = found.of(_apart(path, number, series, decoder) if packed else series.asarray())
     orientation = int(series.keyframe.tags.valueof(274, 1) or 1)
     if orientation != 1:
         problem = f"its tag Orientation is {orientation}: row 0 is not the top, or column 0 not the left"
@@ -97,13 +102,13 @@ def _read(path: Path, file: Any, given: Given, messages: list[str]) -> Stored:
     return Stored(values, affine_of(_spacing(path, file, series, image, found, given)), missing=_missing(series))
 
 
-def _apart(path: Path, number: int, series: Any) -> Any:
+def _apart(path: Path, number: int, series: Any, decoder: Any) -> np.ndarray:
     """All pages, from a process of its own: the decoder of LZW, native code, crashes on damaged ones."""
     if importlib.util.find_spec("imagecodecs") is None:
         raise VolumeError(path, "its compression (LZW) needs the package imagecodecs: pip install imagecodecs")
     count = math.prod(series.shape) * series.dtype.itemsize
     task = {"kind": "tiff", "file": str(path), "series": number, "bytes": count}
-    return decoded(path, task, count).view(series.dtype).reshape(series.shape)
+    return decoder(path, task, count).view(series.dtype).reshape(series.shape)
 
 
 def _series(path: Path, file: Any, images: list[OmeImage], given: Given, messages: list[str]) -> tuple[int, Any]:
