@@ -1,8 +1,6 @@
 """Small scenes that several test files share. Everything random comes from fixed seeds; arrays are NumPy float64, so that a scene
 takes the precision of the moment it is built in."""
 
-import functools
-
 import jax
 import numpy as np
 
@@ -11,12 +9,6 @@ import jvr
 # One jitted function for all tests: scenes of the same structure share a compiled program.
 render = jax.jit(jvr.render)
 SETTINGS = jvr.Settings(0.37, termination=0)
-
-# `jit` for many small programs: compiling is what takes the time then, and this takes a fifth of it.
-compiled = functools.partial(
-    jax.jit, compiler_options={"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-)
-render_quickly = compiled(jvr.render)
 
 
 def rotation(x: float, y: float, z: float) -> np.ndarray:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pages
 import pytest
-from scenes import render_quickly
+from scenes import render
 
 import jvr
 from jvr.io import kinds
@@ -67,7 +67,7 @@ def test_a_slab_of_the_transfer_function_is_as_opaque_as_its_length_says(added):
     scene = jvr.Scene(jvr.Volume(np.full((4, 4, 4), 0.5, np.float32)), added.RampTransfer(0.25, 0.75, (1.0, 0.5, 0.25), 0.8))
     camera = jvr.OrthographicCamera.look_at([1.5, 1.5, 9.0], [1.5, 1.5, 1.5], [0.0, 1.0, 0.0], 1.0, 2, 2)
     opacity = 1 - np.exp(-0.4 * 3)
-    picture = render_quickly(scene, camera)
+    picture = render(scene, camera)
     np.testing.assert_allclose(picture.alpha, opacity, rtol=1e-5)
     np.testing.assert_allclose(picture.rgb[0, 0], opacity * np.array([1, 0.5, 0.25]), rtol=1e-5)
 
@@ -207,7 +207,7 @@ def test_the_integrator_finds_the_largest_scalar(added):
     grey = jvr.LinearTransfer([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [0, 1])
     look = jvr.OrthographicCamera.look_at([3.0, 3.5, 30.0], [3.0, 3.5, 4.0], [0.0, 1.0, 0.0], 4.0, 4, 4)
     settings = jvr.Settings(0.02, sampling=added.MaximumProjection())
-    picture = render_quickly(jvr.Scene(jvr.Volume(values), grey), look, settings)
+    picture = render(jvr.Scene(jvr.Volume(values), grey), look, settings)
     centres = (np.arange(4) + 0.5) - 2
     x, y = 3 + centres[None, :], 3.5 - centres[:, None]
     # The ray ends at z = 0, half a sample behind the last.

@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from scenes import compiled
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -18,7 +17,7 @@ GRADIENT = 1e-3
 
 @pytest.mark.slow
 def test_hard_cases():
-    result = stability.table(quick=True, jit=compiled)
+    result = stability.table(quick=True, jit=jax.jit)
     assert len(result) > 15
     for row in result:
         assert not row["not finite"], row
@@ -29,7 +28,7 @@ def test_hard_cases():
 @pytest.mark.slow
 def test_an_opaque_medium_keeps_its_digits():
     """Depth 0, 1e-3, 1e4 to the eye and to both lights."""
-    ways = stability.compiled_ways(compiled)
+    ways = stability.compiled_ways(jax.jit)
     (cases,) = list(stability.rows(quick=True).values())[:1]
     for case in cases:
         found = stability.measured(case, ways, modes=False)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import compiled, linear_transfer, render_quickly
+from scenes import linear_transfer, render
 
 import jvr
 
@@ -25,7 +25,7 @@ def cut_open(values, shading, normals, x=8.3):
         jvr.Volume(values), OPAQUE, lights=(jvr.DirectionalLight(LIGHT),), shading=shading, clipping=box, normals=normals
     )
     camera = jvr.OrthographicCamera.look_at([60, 7.5, 7.5], [7.5, 7.5, 7.5], [0, 0, 1], 9.0, 8, 8)
-    return np.asarray(render_quickly(scene, camera, jvr.Settings(0.5)).rgb[..., 0])
+    return np.asarray(render(scene, camera, jvr.Settings(0.5)).rgb[..., 0])
 
 
 @pytest.mark.parametrize("normals", [jvr.AnalyticGradient(), jvr.CentralDifferences()], ids=lambda n: type(n).__name__)
@@ -45,7 +45,7 @@ def test_rounding_makes_no_surfaces(normals):
     volume = jvr.Volume(np.full((6, 6, 6), 0.7), intercept=-0.1)
     scene = jvr.Scene(volume, OPAQUE, lights=(jvr.DirectionalLight(LIGHT),), shading=jvr.Lambert(0.0), normals=normals)
     camera = jvr.PerspectiveCamera.look_at([20.0, 14, 11], [2.5, 2.5, 2.5], [0, 0, 1], 8.0, 8, 8)
-    image = render_quickly(scene, camera, jvr.Settings(0.37))
+    image = render(scene, camera, jvr.Settings(0.37))
     np.testing.assert_allclose(image.rgb[..., 0], 1.0, atol=1e-4)
 
 
@@ -70,9 +70,9 @@ def test_derivatives_of_a_cut_through_a_translucent_medium(x64):
         return jnp.sum(weight * jvr.render(scene, camera, settings).rgb)
 
     p = jnp.asarray([0.63, 0.87, 0.71, 4.21, 5.13, 6.37, *LIGHT])
-    gradient = np.asarray(compiled(jax.jacfwd(loss))(p))
+    gradient = np.asarray(jax.jit(jax.jacfwd(loss))(p))
     h = 1e-6 * np.eye(9)
-    value = compiled(lambda points: jax.lax.map(loss, points))
+    value = jax.jit(lambda points: jax.lax.map(loss, points))
     expected = (np.asarray(value(p + h)) - np.asarray(value(p - h))) / 2e-6
     np.testing.assert_allclose(gradient, expected, atol=1e-5 * np.abs(expected).max())
     assert np.abs(gradient).min() > 1e-4
@@ -92,7 +92,7 @@ def test_a_ball_of_labels_is_lit_as_a_ball():
     volume = jvr.Volume(values, interpolation=jvr.Nearest())
     scene = jvr.Scene(volume, transfer, lights=(jvr.DirectionalLight(LIGHT),), shading=jvr.Lambert(0.0))
     camera = jvr.OrthographicCamera.look_at(center + np.array([40.0, 0, 0]), center, [0, 0, 1], 20.0, 32, 32)
-    image = np.asarray(render_quickly(scene, camera, jvr.Settings(0.25)).rgb[..., 0])
+    image = np.asarray(render(scene, camera, jvr.Settings(0.25)).rgb[..., 0])
     y = (np.arange(32) + 0.5 - 16) / 32 * 2
     y, z = y, -y[:, None]
     across = y**2 + z**2
@@ -119,6 +119,6 @@ def test_labels_are_shaded_by_what_is_seen(x64):
         return jnp.sum(weight * jvr.render(scene, camera, jvr.Settings(0.5, termination=0)).rgb)
 
     sigma_t, h = jnp.asarray([0.05, 0.3, 0.2, 0.6]), 1e-6 * np.eye(4)
-    value = compiled(lambda points: jax.lax.map(loss, points))
+    value = jax.jit(lambda points: jax.lax.map(loss, points))
     expected = (np.asarray(value(sigma_t + h)) - np.asarray(value(sigma_t - h))) / 2e-6
-    np.testing.assert_allclose(compiled(jax.grad(loss))(sigma_t), expected, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(jax.jit(jax.grad(loss))(sigma_t), expected, atol=1e-6 * np.abs(expected).max())

@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from scenes import OBLIQUE, perspective, render_quickly, voxels
+from scenes import OBLIQUE, perspective, render, voxels
 
 import jvr
 from jvr.rendering.advise import effects_of, remarks_on
@@ -175,7 +175,7 @@ def dark_scene():
 
 
 def without(one, **parts):
-    return np.asarray(render_quickly(dataclasses.replace(one, **parts), perspective(one.volume, 8, 6)).rgb)
+    return np.asarray(render(dataclasses.replace(one, **parts), perspective(one.volume, 8, 6)).rgb)
 
 
 def test_effects_are_those_that_the_scene_may_do_without():

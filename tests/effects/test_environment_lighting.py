@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import OBLIQUE, compiled, linear_transfer, perspective, rotation, voxels
+from scenes import OBLIQUE, linear_transfer, perspective, rotation, voxels
 
 import jvr
 from jvr.effects.diffusion import kernel_of, scatter
@@ -36,12 +36,12 @@ def scene(material=None, transfer=None, shape=(5, 6, 7), **parts):
 
 def picture(scene, settings=SETTINGS):
     camera = perspective(scene.volume, width=6, height=5)
-    return compiled(jvr.render, static_argnums=2)(scene, camera, settings).rgb
+    return jax.jit(jvr.render, static_argnums=2)(scene, camera, settings).rgb
 
 
 def transfer_at(scene):
     """Coefficients at the nodes of a scene, `(nodes, channels, bands)`, and `solid` and `facing` side by side."""
-    return compiled(
+    return jax.jit(
         lambda s: project_all(RadianceTransferProjection.of(s, absorbing(s, None, s.radiance_transfer.rays_need_gradient)))
     )(scene)
 
@@ -204,7 +204,7 @@ def test_above_an_opaque_half_space(material):
         radiance_transfer=jvr.RadianceTransfer(rays=1024, resolution=0.1),
     )
     projection = RadianceTransferProjection.of(half_space, absorbing(half_space, None, False))
-    c, around = compiled(lambda q, p: q.project(p))(projection, jnp.array([[20.0, 20.0, 10.2], [20.0, 20.0, 9.0]]))
+    c, around = jax.jit(lambda q, p: q.project(p))(projection, jnp.array([[20.0, 20.0, 10.2], [20.0, 20.0, 9.0]]))
     from jvr.model.harmonics.projection import cap
 
     expected = np.zeros((2, 16))
@@ -357,7 +357,7 @@ def test_what_was_computed_for_another_scene_is_refused(bleeding):
     """With concrete arrays, and where the scene is an argument of a compiled function."""
     frozen = jvr.precompute(scene(transfer=jvr.RadianceTransfer(rays=4, resolution=0.4, bleeding=bleeding)))
     camera, volume = perspective(frozen.volume, width=4, height=4), frozen.volume
-    compiled_render = compiled(lambda s: jvr.render(s, camera, SETTINGS).rgb)
+    compiled_render = jax.jit(lambda s: jvr.render(s, camera, SETTINGS).rgb)
     expected = compiled_render(frozen)
     assert np.any(expected > 0)
     # Equal numbers in other arrays are no other scene.
@@ -393,7 +393,7 @@ def test_what_is_refused_is_computed_again_or_pinned(tmp_path):
     changed = dataclasses.replace(lit, volume=jvr.Volume(voxels(lit.volume.shape, seed=9), OBLIQUE))
     frozen = jvr.precompute(lit, cache=tmp_path)
     camera = perspective(lit.volume, width=6, height=5)
-    of_voxels = compiled(lambda v: jvr.render(eqx.tree_at(lambda s: s.volume.values, frozen, v), camera, SETTINGS).rgb)
+    of_voxels = jax.jit(lambda v: jvr.render(eqx.tree_at(lambda s: s.volume.values, frozen, v), camera, SETTINGS).rgb)
     np.testing.assert_allclose(of_voxels(lit.volume.values), picture(lit), atol=1e-5)
     with pytest.raises(Exception, match=r"another .*jvr.precompute\(scene\) again"):
         jax.block_until_ready(of_voxels(changed.volume.values))
@@ -597,10 +597,10 @@ def test_gradients_against_differences(name):
         x = where(lit)
         along = jnp.asarray(np.random.default_rng(4).normal(size=x.shape)) * jnp.maximum(jnp.abs(x), 1e-3)
         h = 1e-6
-        value = compiled(f)
+        value = jax.jit(f)
         difference = (value(x + h * along) - value(x - h * along)) / (2 * h)
-        reverse = jnp.sum(compiled(jax.grad(f))(x) * along)
-        forward = compiled(lambda x: jax.jvp(lambda x: f(x, jvr.Forward()), (x,), (along,))[1])(x)
+        reverse = jnp.sum(jax.jit(jax.grad(f))(x) * along)
+        forward = jax.jit(lambda x: jax.jvp(lambda x: f(x, jvr.Forward()), (x,), (along,))[1])(x)
     assert abs(float(difference)) > 1e-6
     np.testing.assert_allclose(reverse, forward, rtol=1e-9)
     np.testing.assert_allclose(reverse, difference, rtol=1e-5, atol=1e-9)

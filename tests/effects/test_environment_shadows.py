@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import compiled, rotation
+from scenes import rotation
 from scipy.ndimage import map_coordinates
 from scipy.special import expn
 
@@ -104,7 +104,7 @@ def compared(name, which, n, size, transfer):
     camera = view(plain, size)
     exact, alpha, depth = brute_force(plain, camera, directions, irradiance)
     lit = dataclasses.replace(plain, environment=environment, material=jvr.LambertBRDF(), radiance_transfer=transfer)
-    found = np.asarray(compiled(jvr.render, static_argnums=2)(lit, camera, SETTINGS).rgb, float)[..., 0]
+    found = np.asarray(jax.jit(jvr.render, static_argnums=2)(lit, camera, SETTINGS).rgb, float)[..., 0]
     wanted = seen(plain, camera, alpha, depth)
     wanted &= exact > 0.1 * np.max(exact[wanted])
     ratio = found[wanted] / exact[wanted]
@@ -176,7 +176,7 @@ def test_a_surface_that_bleeds_into_itself(bleeding):
         radiance_transfer=jvr.RadianceTransfer(bleeding=bleeding),
     )
     camera = jvr.OrthographicCamera.look_at([center, center, 60.0], [center] * 3, [0, 1, 0], radius, 5, 5)
-    found = np.asarray(compiled(jvr.render, static_argnums=2)(scene, camera, SETTINGS).rgb, float).reshape(-1, 3)
+    found = np.asarray(jax.jit(jvr.render, static_argnums=2)(scene, camera, SETTINGS).rgb, float).reshape(-1, 3)
 
     values = np.asarray(scene.volume.values, float)
     sigma = lambda p: 5 * np.maximum(map_coordinates(values, np.moveaxis(p, -1, 0), order=1, cval=0.0) - 0.05, 0) / 0.95

@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import OBLIQUE, compiled, linear_transfer, perspective, rotation, voxels
-from scenes import render_quickly as render
+from scenes import OBLIQUE, linear_transfer, perspective, render, rotation, voxels
 
 import jvr
 
@@ -356,7 +355,7 @@ def test_soft_shadows_converge_as_samples_do(x64):
             )
             return jvr.render(scene, camera, jvr.Settings(2.0)).rgb[0, 0, 0]
 
-        found = compiled(lambda keys: jax.lax.map(radiance, keys))(jax.random.split(jax.random.key(7), 100))
+        found = jax.jit(lambda keys: jax.lax.map(radiance, keys))(jax.random.split(jax.random.key(7), 100))
         return found / (2e-6 / (4 * math.pi) * 144 / 12**2) - 0.5
 
     sphere = lambda position, key, n: jvr.sphere_light(position, 1.0, 144.0, key=key, samples=n)

@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import OBLIQUE, affine, compiled, linear_transfer, perspective, voxels
-from scenes import render_quickly as render
+from scenes import OBLIQUE, affine, linear_transfer, perspective, render, voxels
 
 import jvr
 
@@ -171,7 +170,7 @@ def test_shadow_map_is_detached(x64):
         )
         return jnp.mean(jvr.render(scene, camera, SETTINGS).rgb)
 
-    of_direction, of_irradiance = compiled(jax.grad(mean, argnums=(0, 1)))(light.direction, light.irradiance)
+    of_direction, of_irradiance = jax.jit(jax.grad(mean, argnums=(0, 1)))(light.direction, light.irradiance)
     # Isotropic scattering: the direction matters for shadows alone.
     assert not of_direction.any()
     assert np.all(np.asarray(of_irradiance) > 0)
@@ -310,7 +309,7 @@ def along_each(p, moves, shadows, h=1e-6):
     """Central differences along each direction."""
     at = lambda move, sign: jax.tree.map(lambda x, d: x + sign * h * d, p, move)
     both = lambda move: [loss(at(move, sign), shadows, jvr.Forward()) for sign in (1.0, -1.0)]
-    above, below = compiled(lambda moves: jax.lax.map(both, moves))(moves)
+    above, below = jax.jit(lambda moves: jax.lax.map(both, moves))(moves)
     return (np.asarray(above) - np.asarray(below)) / (2 * h)
 
 
@@ -321,7 +320,7 @@ def test_replay_against_central_differences(method, x64):
     """Along a random direction in each kind of array: transfer function, voxels, lights, pose, camera, phase function, albedo."""
     p, shadows = parameters(), SHADOWS[method]
     names, moves = directions(p)
-    gradient = compiled(jax.grad(lambda p: loss(p, shadows, jvr.Replay())))(p)
+    gradient = jax.jit(jax.grad(lambda p: loss(p, shadows, jvr.Replay())))(p)
     found = [
         sum(jnp.vdot(g, m[k]) for g, m in zip(*map(jax.tree.leaves, (gradient, moves)), strict=True)) for k in range(len(names))
     ]
@@ -337,8 +336,8 @@ def test_replay_against_central_differences(method, x64):
 def test_replay_against_forward_mode(method, x64):
     """Every entry."""
     p, shadows = parameters(), SHADOWS[method]
-    reverse = compiled(jax.grad(lambda p: loss(p, shadows, jvr.Replay())))(p)
-    forward = compiled(jax.jacfwd(lambda p: loss(p, shadows, jvr.Forward())))(p)
+    reverse = jax.jit(jax.grad(lambda p: loss(p, shadows, jvr.Replay())))(p)
+    forward = jax.jit(jax.jacfwd(lambda p: loss(p, shadows, jvr.Forward())))(p)
     for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(reverse), jax.tree.leaves(forward), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=ROUNDING * np.abs(b).max(), err_msg=jax.tree_util.keystr(path))
 
@@ -365,10 +364,10 @@ def test_a_clipping_box_with_shadows(x64):
     faces = jnp.stack([center - jnp.array([1.1, 1.9, 1.3]), center + jnp.array([1.2, 1.4, 2.1])])
     for name in ("rays", "opacity map"):
         mean = functools.partial(of_faces, SHADOWS[name])
-        gradient = compiled(jax.grad(functools.partial(mean, jvr.Replay())))(faces)
+        gradient = jax.jit(jax.grad(functools.partial(mean, jvr.Replay())))(faces)
         moved = faces + 1e-6 * np.concatenate([np.eye(6), -np.eye(6)]).reshape(12, 2, 3)
         above, below = np.split(
-            np.asarray(compiled(functools.partial(jax.lax.map, functools.partial(mean, jvr.Forward())))(moved)), 2
+            np.asarray(jax.jit(functools.partial(jax.lax.map, functools.partial(mean, jvr.Forward())))(moved)), 2
         )
         expected = ((above - below) / 2e-6).reshape(2, 3)
         np.testing.assert_allclose(gradient, expected, atol=1e-6 * np.abs(expected).max())
@@ -402,10 +401,10 @@ def test_light_moved_and_occluder_thickened(shadows, x64):
         return jnp.mean(jvr.render(scene, camera, jvr.Settings(0.5)).rgb[:, 14:20])
 
     p = {"occluder": jnp.array(0.6), "position": jnp.array([7.0, 6.3, 16.0])}
-    gradient = compiled(jax.grad(brightness))(p)
+    gradient = jax.jit(jax.grad(brightness))(p)
     moves = [("occluder", 0.01 * np.ones(()))] + [("position", 0.01 * np.eye(3)[a]) for a in range(3)]
     ends = [p | {name: p[name] + sign * move} for name, move in moves for sign in (1, -1)]
-    values = compiled(lambda ends: jax.lax.map(brightness, ends))(jax.tree.map(lambda *x: jnp.stack(x), *ends)).reshape(-1, 2)
+    values = jax.jit(lambda ends: jax.lax.map(brightness, ends))(jax.tree.map(lambda *x: jnp.stack(x), *ends)).reshape(-1, 2)
     for (name, move), (above, below) in zip(moves, np.asarray(values), strict=True):
         expected, found = above - below, 2 * np.sum(move * np.asarray(gradient[name]))
         # Central differences of steps of a hundredth: their own error is up to 4e-3 (one of 2e-4 a tenth as long), from the kinks between
@@ -420,7 +419,7 @@ def test_vmap_of_gradients_through_shadows(x64):
     p = parameters()
     of = jax.grad(lambda direction: loss(p | {"sun": p["sun"] | {"direction": direction}}, SHADOWS["rays"], jvr.Replay()))
     several = jnp.stack([p["sun"]["direction"], jnp.array([-0.3, 1.0, 0.2])])
-    np.testing.assert_allclose(compiled(jax.vmap(of))(several), compiled(lambda d: jax.lax.map(of, d))(several), rtol=1e-10)
+    np.testing.assert_allclose(jax.jit(jax.vmap(of))(several), jax.jit(lambda d: jax.lax.map(of, d))(several), rtol=1e-10)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import export
-from scenes import compiled, gaussian_transfer, lut_transfer, perspective, render, small
+from scenes import gaussian_transfer, lut_transfer, perspective, render, small
 
 import jvr
 from jvr.execution import tiles
@@ -106,7 +106,7 @@ def test_a_derivative_outside_of_jit_is_that_of_one_program(x64, adjoint, lit):
         return jnp.sum(jnp.sin(picture.rgb)) + jnp.sum(picture.alpha) + jnp.sum(picture.depth)
 
     of = jax.value_and_grad(loss)
-    ours, whole = of(into(scene)), compiled(of)(into(scene))
+    ours, whole = of(into(scene)), jax.jit(of)(into(scene))
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-11 * float(jnp.max(jnp.abs(b))))
     jax.tree.map(close, ours, whole)
     with jax.log_compiles(), compilations() as names:
@@ -195,8 +195,8 @@ def test_functions_of_scenes_are_exported_to_another_process(tmp_path):
     scene, camera = small(), perspective(small().volume, 7, 5)
     loss = lambda transfer, scene: jnp.mean(jnp.sin(jvr.render(eqx.tree_at(lambda s: s.transfer, scene, transfer), camera).rgb))
     functions = {
-        "picture": compiled(lambda scene: jvr.render(scene, camera)),
-        "gradient": compiled(lambda scene: jax.grad(loss)(scene.transfer, scene)),
+        "picture": jax.jit(lambda scene: jvr.render(scene, camera)),
+        "gradient": jax.jit(lambda scene: jax.grad(loss)(scene.transfer, scene)),
     }
     for name, function in functions.items():
         (tmp_path / name).write_bytes(export.export(function)(scene).serialize())

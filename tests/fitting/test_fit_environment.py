@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import compiled
 
 import jvr
 from jvr.fitting.kinds import has_table_jacobian, march_unknowns
@@ -46,7 +45,7 @@ def scene(volume, sigma=0.5, **parts):
 
 def views(one, noise=0.0):
     cameras = jvr.fibonacci_sphere(one.volume.center, 16.0, 4, 34.0, 8, 8)
-    render = compiled(jvr.render, static_argnums=2)
+    render = jax.jit(jvr.render, static_argnums=2)
     images = [np.asarray(render(one, camera, SETTINGS).rgb) for camera in cameras]
     rng = np.random.default_rng(0)
     return cameras, [image + noise * rng.standard_normal(image.shape) for image in images]
@@ -168,7 +167,7 @@ def test_rows_under_a_frozen_transfer(volume, frozen):
         image = lambda sigma_t: (
             jvr.render(eqx.tree_at(lambda s: s.transfer.sigma_t, frozen, sigma_t), camera, jvr.Settings(1.5, adjoint=adjoint)).rgb
         )
-        return compiled(jax.jacfwd(image))(frozen.transfer.sigma_t)
+        return jax.jit(jax.jacfwd(image))(frozen.transfer.sigma_t)
 
     by_rows, forward = jacobian(jvr.Rows()), jacobian(jvr.Forward())
     np.testing.assert_allclose(by_rows, forward, rtol=1e-4, atol=1e-5 * np.abs(forward).max())
@@ -184,7 +183,7 @@ def both_ways(one, unknowns):
     vectors = [normal_equations(problem, values, observations, i, around=around).vector for i in range(observations.tile_count())]
     # In unconstrained space every value is itself.
     identity = eqx.tree_at(lambda p: p.unknowns.bijectors, problem, tuple(jvr.Identity() for _ in problem.unknowns.bijectors))
-    gradient = compiled(jax.grad(lambda v: value(identity, v, observations, total)))(values)
+    gradient = jax.jit(jax.grad(lambda v: value(identity, v, observations, total)))(values)
     return 2 * sum(np.asarray(v, np.float64) for v in vectors) / float(total), gradient
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import render_quickly
+from scenes import render
 
 import jvr
 from jvr.model.parameters import is_by_channel
@@ -71,10 +71,10 @@ def test_a_channel_of_light_acts_on_its_own_channel_of_a_picture_alone(volume):
     (camera, *_) = jvr.fibonacci_sphere(one.volume.center, 24.0, 1, 34.0, 8, 8)
     paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(one) if is_by_channel(one, path)]
     assert len(paths) == len(lights) + 1
-    before = render_quickly(one, camera, SETTINGS).rgb
+    before = render(one, camera, SETTINGS).rgb
     for path in paths:
         brighter = lambda p, x, path=path: x.at[..., 1].multiply(1.5) if p == path else x
-        change = render_quickly(jax.tree_util.tree_map_with_path(brighter, one), camera, SETTINGS).rgb - before
+        change = render(jax.tree_util.tree_map_with_path(brighter, one), camera, SETTINGS).rgb - before
         np.testing.assert_array_equal(change[..., 0::2], 0.0)
         assert float(jnp.max(change[..., 1])) > 1e-3
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import compiled, perspective
+from scenes import perspective
 
 import jvr
 from jvr.model.kept import is_made_of, note_sources
@@ -62,7 +62,7 @@ def replacements(kind: str):
         yield "another type", lambda v: eqx.tree_at(lambda v: v.values, v, other.values.astype(jnp.float32) + 0.5)
 
 
-as_argument = compiled(lambda scene, camera: jvr.render(scene, camera, SETTINGS))
+as_argument = jax.jit(lambda scene, camera: jvr.render(scene, camera, SETTINGS))
 
 
 def close(found: jvr.Rendering, expected: jvr.Rendering, name: str):
@@ -104,7 +104,7 @@ def test_pictures_where_voxels_are_the_only_argument(kind):
     camera = perspective(before, 7, 6)
     of_voxels = lambda v: jvr.render(scene_of(kind, eqx.tree_at(lambda v: v.values, before, v)), camera, SETTINGS)
     anew = without(eqx.tree_at(lambda v: v.values, before, after.values))
-    close(compiled(of_voxels)(after.values), as_argument(scene_of(kind, anew), camera), kind)
+    close(jax.jit(of_voxels)(after.values), as_argument(scene_of(kind, anew), camera), kind)
 
 
 @pytest.mark.parametrize("way", ["compiled", pytest.param("concrete", marks=pytest.mark.slow)])
@@ -120,7 +120,7 @@ def test_gradients_in_voxels_know_what_is_kept_of_them(kind, way):
 
     gradient = jax.grad(loss)
     if way == "compiled":
-        gradient = compiled(gradient)
+        gradient = jax.jit(gradient)
     for seed in (0, 1):
         values = jnp.asarray(voxels(kind, seed))
         kept, anew = gradient(values, keep(kind, plain(kind))), gradient(values, plain(kind))
@@ -136,7 +136,7 @@ def test_forward_derivatives_know_what_is_kept_of_the_voxels():
         scene = scene_of("graded", eqx.tree_at(lambda v: v.values, volume, values))
         return jvr.render(scene, camera, jvr.Settings(0.7, adjoint=jvr.Forward())).rgb
 
-    slope = compiled(lambda values, volume: jax.jvp(lambda v: picture(v, volume), (values,), (change,))[1])
+    slope = jax.jit(lambda values, volume: jax.jvp(lambda v: picture(v, volume), (values,), (change,))[1])
     values = jnp.asarray(voxels("graded", 1))
     kept, anew = slope(values, plain("graded").graded()), slope(values, plain("graded"))
     np.testing.assert_allclose(kept, anew, rtol=1e-4, atol=1e-5 * np.abs(anew).max())

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
-from scenes import OBLIQUE, affine, gaussian_transfer, linear_transfer, lut_transfer, perspective, render_quickly, voxels
+from scenes import OBLIQUE, affine, gaussian_transfer, linear_transfer, lut_transfer, perspective, render, voxels
 
 import jvr
 from jvr.atomic import replacing_together
@@ -257,7 +257,7 @@ def test_pictures_of_the_loaded_scene_are_the_same(tmp_path, name):
     found = again(expected, tmp_path)
     check_same(found, expected)
     camera = perspective(expected.volume, 4, 3)
-    pictures = [render_quickly(s, camera, jvr.Settings(0.7)) for s in (found, expected)]
+    pictures = [render(s, camera, jvr.Settings(0.7)) for s in (found, expected)]
     assert float(pictures[1].alpha.max()) > 0.05
     np.testing.assert_array_equal(pictures[0].rgb, pictures[1].rgb)
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import OBLIQUE, affine, compiled, gaussian_transfer, linear_transfer, lut_transfer, orthographic, perspective, voxels
+from scenes import OBLIQUE, affine, gaussian_transfer, linear_transfer, lut_transfer, orthographic, perspective, voxels
 
 import jvr
 from jvr.march.compact import for_each, map_selected, write
@@ -16,7 +16,7 @@ from jvr.march.slices import SliceOptions, slice_level, synthesise
 from jvr.model.exact import Remainder
 from jvr.rendering.adaptive import render_slices
 
-render = compiled(jvr.render)
+render = jax.jit(jvr.render)
 WIDTH, HEIGHT = 45, 38
 
 
@@ -104,8 +104,8 @@ def test_refined_pictures_have_derivatives(x64):
         return jnp.sum(picture.rgb * weights), picture.stats.sampling.rays
 
     tables = (s.transfer.rgb, s.transfer.sigma_t)
-    value_of = compiled(value)
-    gradient, rays = compiled(jax.grad(value, has_aux=True))(tables)
+    value_of = jax.jit(value)
+    gradient, rays = jax.jit(jax.grad(value, has_aux=True))(tables)
     assert int(rays) < 13 * 17
     along, h = random_like(tables), 1e-6
     (high, more), (low, less) = (value_of(jax.tree.map(lambda x, d, t=t: x + t * d, tables, along)) for t in (h, -h))
@@ -154,7 +154,7 @@ def test_every_selected_element_is_worked_on_once(size, share):
     mask = np.random.default_rng(size).random(size) < share
     values = np.arange(size)
     body = lambda index, valid, read, found: write(found, index, valid, found[index] + read + 1)
-    found = compiled(lambda m: for_each(m, lambda i: jnp.asarray(values)[i], body, jnp.zeros(size, jnp.int32)))(mask)
+    found = jax.jit(lambda m: for_each(m, lambda i: jnp.asarray(values)[i], body, jnp.zeros(size, jnp.int32)))(mask)
     np.testing.assert_array_equal(found, np.where(mask, values + 1, 0))
 
 
@@ -165,7 +165,7 @@ def test_a_selected_map_has_the_derivative_of_the_map(x64):
     some = lambda a, x, y: jnp.sum(weights * map_selected(f, mask, a, (x, y)))
     whole = lambda a, x, y: jnp.sum(weights * jnp.where(mask, f(a, (x, y)), 0.0))
     mask = jnp.asarray(mask)
-    for found, wanted in zip(*(compiled(jax.grad(g, (0, 1, 2)))(1.3, x, x[::-1]) for g in (some, whole)), strict=True):
+    for found, wanted in zip(*(jax.jit(jax.grad(g, (0, 1, 2)))(1.3, x, x[::-1]) for g in (some, whole)), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
 
 
@@ -176,7 +176,7 @@ def test_an_envelope_is_what_is_wanted_plus_the_way_to_it():
     index = np.stack(np.meshgrid(*map(np.arange, wanted.shape), indexing="ij"), -1).reshape(-1, 3)
     slabs = np.maximum(np.abs(index[:, None] - index[None]) - 1, 0) * np.array(thickness)
     exact = np.minimum(np.min(np.max(slabs, -1) + wanted.reshape(-1), axis=1), farthest).reshape(wanted.shape)
-    found = compiled(envelope)(jnp.asarray(wanted), tuple(map(jnp.asarray, thickness)), jnp.asarray(farthest))
+    found = jax.jit(envelope)(jnp.asarray(wanted), tuple(map(jnp.asarray, thickness)), jnp.asarray(farthest))
     # Radii grow by the thinnest slab: never too far, and short by less than one of them.
     assert np.all(found <= exact + 1e-5)
     assert np.all(found > exact - 1.0)
@@ -188,7 +188,7 @@ STEP = np.where(np.arange(24)[:, None, None] < 12, 0.1, 0.9) * np.ones((24, 3, 3
 ORACLES = (jvr.OpacityChange, jvr.BrickRange, jvr.LocalError)
 
 
-@functools.partial(compiled, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0)
 def ask(oracle, volume, transfer, optical, farthest):
     return distance_field(oracle, volume, transfer, optical, farthest)
 
@@ -404,8 +404,8 @@ def test_gradients_against_differences_with_the_placement_frozen(x64, optical):
         p["transfer"] = linear_transfer(coloured=True)
     # Where nothing attenuates emission, a smaller tolerance leaves out less than a fifth of the samples.
     distances = ask(jvr.LocalError(0.03), jvr.Volume(p["voxels"], OBLIQUE), p["transfer"], optical, jnp.asarray(40.0))
-    value = compiled(lambda p: loss(p, distances, optical))
-    gradient, stats = compiled(jax.grad(lambda p: loss(p, distances, optical), has_aux=True))(p)
+    value = jax.jit(lambda p: loss(p, distances, optical))
+    gradient, stats = jax.jit(jax.grad(lambda p: loss(p, distances, optical), has_aux=True))(p)
     assert int(stats.samples[0]) < 0.8 * int(stats.full)
     assert np.all(np.asarray(stats.samples) > 0)
     for name in p:
@@ -425,7 +425,7 @@ def test_values_and_gradients_at_extremes_are_those_of_double_precision():
     weights = np.arange(216.0).reshape(8, 9, 3)
     floats = lambda tree, dtype: jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tree)
 
-    @compiled
+    @jax.jit
     def value_and_gradient(s, camera, weights):
         def total(transfer):
             changed = eqx.tree_at(lambda s: s.transfer, s, transfer)

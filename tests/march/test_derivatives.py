@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import OBLIQUE, compiled, gaussian_transfer, linear_transfer, lut_transfer, perspective, voxels
+from scenes import OBLIQUE, gaussian_transfer, linear_transfer, lut_transfer, perspective, voxels
 
 import jvr
 from jvr.rendering.trace import trace
@@ -74,7 +74,7 @@ def central_differences(loss, p, h=1e-6):
     flat = np.concatenate([np.ravel(x) for x in leaves])
     split = lambda v: jax.tree.unflatten(structure, [a.reshape(x.shape) for a, x in zip(jnp.split(v, ends), leaves, strict=True)])
     moved = np.concatenate([flat + h * np.eye(flat.size), flat - h * np.eye(flat.size)])
-    above, below = jnp.split(compiled(lambda v: jax.lax.map(lambda x: loss(split(x)), v, batch_size=64))(moved), 2)
+    above, below = jnp.split(jax.jit(lambda v: jax.lax.map(lambda x: loss(split(x)), v, batch_size=64))(moved), 2)
     return split((above - below) / (2 * h))
 
 
@@ -95,11 +95,11 @@ def agree(one, other, tolerance):
 def check_every_way(p, names, rows=(jax.jacfwd, jax.grad), **options):
     """All ways for the parameters called `names`."""
     fixed, moving = {k: v for k, v in p.items() if k not in names}, {k: p[k] for k in names}
-    replay = compiled(jax.grad(make_loss(fixed, jvr.Replay(), **options)))(moving)
+    replay = jax.jit(jax.grad(make_loss(fixed, jvr.Replay(), **options)))(moving)
     agree(replay, central_differences(make_loss(fixed, jvr.Forward(), **options), moving), DIFFERENCES)
-    agree(compiled(jax.jacfwd(make_loss(fixed, jvr.Forward(), **options)))(moving), replay, ROUNDING)
+    agree(jax.jit(jax.jacfwd(make_loss(fixed, jvr.Forward(), **options)))(moving), replay, ROUNDING)
     for transform in rows:
-        agree(compiled(transform(make_loss(fixed, jvr.Rows(), **options)))(moving), replay, ROUNDING)
+        agree(jax.jit(transform(make_loss(fixed, jvr.Rows(), **options)))(moving), replay, ROUNDING)
 
 
 @pytest.mark.slow
@@ -146,7 +146,7 @@ def test_tiles_and_no_jit(x64):
     """Gradients that add up over tiles which do not divide the picture, without `jit`."""
     p = parameters(TRANSFERS["linear"]())
     fixed, moving = {k: v for k, v in p.items() if k != "transfer"}, {"transfer": p["transfer"]}
-    whole = compiled(jax.grad(make_loss(fixed, jvr.Replay())))(moving)
+    whole = jax.jit(jax.grad(make_loss(fixed, jvr.Replay())))(moving)
     agree(jax.grad(make_loss(fixed, jvr.Replay(), tile=7))(moving), whole, ROUNDING)
 
 
@@ -168,8 +168,8 @@ def test_vmapped(transform, adjoint, x64):
     transfers = [linear_transfer(seed=seed) for seed in (1, 5)]
     eyes = jnp.stack([p["eye"], p["eye"] + jnp.array([0.5, 1.0, -0.7])])
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *transfers)
-    batch = compiled(jax.vmap(gradient))(stacked, eyes)
-    alone = compiled(lambda x: jax.lax.map(lambda x: gradient(*x), x))((stacked, eyes))
+    batch = jax.jit(jax.vmap(gradient))(stacked, eyes)
+    alone = jax.jit(lambda x: jax.lax.map(lambda x: gradient(*x), x))((stacked, eyes))
     agree(batch, alone, ROUNDING)
 
 
@@ -197,10 +197,10 @@ def test_rows_of_a_table(kind, termination, x64):
         return of
 
     entries = {"rgb": p["transfer"].rgb, "sigma_t": 4 * p["transfer"].sigma_t}
-    expected = compiled(jax.jacfwd(gathered(jvr.Forward())))(entries)
-    forward = compiled(jax.jacfwd(gathered(jvr.Rows())))(entries)
-    reverse = compiled(jax.jacrev(gathered(jvr.Rows())))(entries)
-    replayed = compiled(jax.jacrev(gathered(jvr.Replay())))(entries)
+    expected = jax.jit(jax.jacfwd(gathered(jvr.Forward())))(entries)
+    forward = jax.jit(jax.jacfwd(gathered(jvr.Rows())))(entries)
+    reverse = jax.jit(jax.jacrev(gathered(jvr.Rows())))(entries)
+    replayed = jax.jit(jax.jacrev(gathered(jvr.Replay())))(entries)
     for other in (forward, reverse, replayed):
         assert jax.tree.structure(other) == jax.tree.structure(expected)
         for a, b in zip(jax.tree.leaves(other), jax.tree.leaves(expected), strict=True):

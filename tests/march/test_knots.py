@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import compiled
 
 import jvr
 from jvr.effects.environment_lighting import environment_lighting
@@ -52,9 +51,9 @@ def test_voxels_at_entries_of_a_table(kind, adjoint, x64):
         return jvr.render(jvr.Scene(jvr.Volume(s * jnp.ones((3, 3, 3))), transfer), camera, settings).rgb[0, 0]
 
     if isinstance(adjoint, jvr.Forward):
-        slope = compiled(lambda s: jax.jvp(picture, (s,), (jnp.ones(()),))[1])
+        slope = jax.jit(lambda s: jax.jvp(picture, (s,), (jnp.ones(()),))[1])
     else:
-        slope = compiled(jax.jacrev(picture))
+        slope = jax.jit(jax.jacrev(picture))
     for s in ENTRIES:
         side = -STEP if s == ENTRIES[-1] else STEP
         expected = (slab(s + side) - slab(s)) / side
@@ -146,7 +145,7 @@ def test_light_of_zero(x64):
     up, tilted = tuple(map(jnp.asarray, (0.0, 0.0, 1.0))), tuple(map(jnp.asarray, (0.0, 0.6, 0.8)))
     s = jnp.asarray(0.5)
 
-    @compiled
+    @jax.jit
     def reflected(light):
         return environment_lighting(material, light, clamped=True, order=1, from_samples=False).reflect(s, s, up, tilted, ())[0][
             0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import OBLIQUE, compiled, perspective
+from scenes import OBLIQUE, perspective
 
 import jvr
 from jvr.march.jacobian import table_jacobian
@@ -202,7 +202,7 @@ def test_gradient_where_matter_begins_is_the_same(x64):
         changed = eqx.tree_at(lambda s: s.volume.values, scene, values)
         return jnp.sum(jvr.render(changed, camera, jvr.Settings(1.0, skipping=skipping)).rgb)
 
-    on, off = (compiled(jax.grad(loss), static_argnums=1)(jnp.asarray(values), skipping) for skipping in (True, False))
+    on, off = (jax.jit(jax.grad(loss), static_argnums=1)(jnp.asarray(values), skipping) for skipping in (True, False))
     np.testing.assert_allclose(on, off, rtol=1e-9, atol=1e-12 * np.abs(off).max())
     assert np.sum(on[:3] != 0) > 20
 
@@ -217,7 +217,7 @@ def test_the_jacobian_is_the_same(x64):
         of_camera, _ = camera_rays(scene, camera, choices, jnp.arange(30, dtype=jnp.int32), prepare(scene, choices))
         return table_jacobian(MarchOptions(0.0, False), *of_camera, of_extinctions=of_extinctions)[1]
 
-    exact, everything, colours = (compiled(lambda o=o: rows(*o))() for o in ((False, True), (True, True), (True, False)))
+    exact, everything, colours = (jax.jit(lambda o=o: rows(*o))() for o in ((False, True), (True, True), (True, False)))
     compare = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
     jax.tree.map(compare, everything, exact)
     jax.tree.map(compare, colours.radiance_rgb, exact.radiance_rgb)
@@ -241,9 +241,9 @@ def test_forward_derivative_of_a_shadow_takes_empty_space_as_well(x64):
         changed = eqx.tree_at(lambda s: s.transfer.sigma_t, scene, scene.transfer.sigma_t.at[0].set(first))
         return jnp.sum(jvr.render(changed, camera, jvr.Settings(0.5, termination=0, adjoint=jvr.Forward())).rgb)
 
-    value, slope = compiled(lambda: jax.jvp(total, (0.0,), (1.0,)))()
+    value, slope = jax.jit(lambda: jax.jvp(total, (0.0,), (1.0,)))()
     step = 1e-4
-    at = compiled(total)
+    at = jax.jit(total)
     differences = (4 * at(step) - at(2 * step) - 3 * value) / (2 * step)
     np.testing.assert_allclose(slope, differences, rtol=1e-5)
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import OBLIQUE, compiled, perspective
+from scenes import OBLIQUE, perspective
 
 import jvr
 
@@ -69,8 +69,8 @@ def close(found, expected):
 )
 def test_hessian_vector_products(unknowns, adjoint, depth, x64):
     loss, start, along = make_loss(unknowns, adjoint, depth)
-    gradient = compiled(jax.grad(loss))
-    product = compiled(lambda x, v: jax.jvp(jax.grad(loss), (x,), (v,))[1])
+    gradient = jax.jit(jax.grad(loss))
+    product = jax.jit(lambda x, v: jax.jvp(jax.grad(loss), (x,), (v,))[1])
     close(product(start, along), differences(gradient, start, along))
 
 
@@ -80,15 +80,15 @@ def test_the_gradient_in_colours_along_extinctions_that_are_zero(adjoint, x64):
     loss, (rgb, sigma_t), (_, along) = make_loss("table", adjoint, depth=False)
     along = jnp.abs(along)
     gradient = lambda sigma_t: jax.grad(lambda rgb: loss((rgb, sigma_t)))(rgb)
-    product = compiled(lambda sigma_t: jax.jvp(gradient, (sigma_t,), (along,))[1])
-    close(product(sigma_t), differences(compiled(gradient), sigma_t, along))
+    product = jax.jit(lambda sigma_t: jax.jvp(gradient, (sigma_t,), (along,))[1])
+    close(product(sigma_t), differences(jax.jit(gradient), sigma_t, along))
 
 
 def test_forward_mode_twice(x64):
     loss, start, along = make_loss("table", jvr.Forward())
     slope = lambda x: jax.jvp(loss, (x,), (along,))[1]
-    twice = compiled(lambda x: jax.jvp(slope, (x,), (along,))[1])
-    close(twice(start), differences(compiled(slope), start, along))
+    twice = jax.jit(lambda x: jax.jvp(slope, (x,), (along,))[1])
+    close(twice(start), differences(jax.jit(slope), start, along))
 
 
 @pytest.mark.parametrize("adjoint", [jvr.Replay(), jvr.Rows()])

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import compiled
 
 import jvr
 from jvr.model.microfacet import ggx, reflectances, visibility
@@ -225,11 +224,11 @@ def test_derivatives_are_those_of_finite_differences(x64, name):
 
     x = jnp.concatenate([jnp.asarray(parameters, float), jnp.zeros(6)])
     step = 1e-6
-    over = compiled(jax.vmap(value))
+    over = jax.jit(jax.vmap(value))
     differences = (over(x + step * jnp.eye(x.size)) - over(x - step * jnp.eye(x.size))) / (2 * step)
     # Central differences in double precision: 1e-10 of rounding over the step, and the step squared.
     for jacobian in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(np.moveaxis(compiled(jacobian(value))(x), -1, 0), differences, rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(np.moveaxis(jax.jit(jacobian(value))(x), -1, 0), differences, rtol=1e-5, atol=1e-7)
 
 
 def extreme_directions():
@@ -267,7 +266,7 @@ def test_values_and_derivatives_are_finite_at_extremes(name):
     w_o, w_i = extreme_directions()
     x = jnp.asarray(values, jnp.float32)
     value = lambda x, w_o, w_i: jnp.sum(total(make(x), w_o, w_i))
-    over = lambda f: compiled(jax.vmap(jax.vmap(f, (None, 0, 0)), (0, None, None)))(x, w_o, w_i)
+    over = lambda f: jax.jit(jax.vmap(jax.vmap(f, (None, 0, 0)), (0, None, None)))(x, w_o, w_i)
     forward = lambda *p: jax.jvp(value, p, jax.tree.map(jnp.ones_like, p))
     assert np.all(np.asarray(over(value)) >= 0)
     for f in (value, jax.grad(value, (0, 1, 2)), forward):

@@ -8,8 +8,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import OBLIQUE, affine, compiled, linear_transfer, perspective, voxels
-from scenes import render_quickly as render
+from scenes import OBLIQUE, affine, linear_transfer, perspective, render, voxels
 
 import jvr
 from jvr.march.fields import VoxelField
@@ -30,7 +29,7 @@ PROPORTIONAL = jvr.LinearTransfer([-10.0, 10.0], np.ones((2, 3)), [-2.8 + 3, 3.2
 SLOPE = 0.3
 
 
-@functools.partial(compiled, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0)
 def _gradients(shape, normals, volume, transfer, points):
     graded = normals.with_gradients(volume, transfer)
 
@@ -154,7 +153,7 @@ def test_what_is_deposited_is_the_derivative_of_what_is_read(scheme, of_opacity,
     cotangent = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), found)
     of_volume, of_normals = pull(cotangent)
     zero = jax.tree.map(jnp.zeros_like, (volume, normals))
-    total, own = compiled(lambda zero, cotangent: normals.deposit(volume, zero, points, cotangent))(zero, cotangent)
+    total, own = jax.jit(lambda zero, cotangent: normals.deposit(volume, zero, points, cotangent))(zero, cotangent)
     for a, b in zip(jax.tree.leaves((wanted(total), own)), jax.tree.leaves((of_volume, of_normals)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
 
@@ -211,7 +210,7 @@ def test_rounding_decides_no_normal_of_an_opacity(scheme):
     assert np.all(found[rises])
 
 
-@compiled
+@jax.jit
 def _in_world(volume, normals, transfer, points):
     """Gradients as shaders take them."""
     frame = GradientFrame(normals, volume.axes_inverse, volume.intercept, volume.shape)
@@ -234,11 +233,11 @@ DEFAULT = [(jvr.PrecomputedGradient, True)]
 def test_gradient_of_a_shaded_picture(scheme, of_opacity, x64):
     """In every voxel and every entry of the transfer function, against central differences."""
     normals, p = scheme(of_opacity), {"values": jnp.asarray(voxels((3, 4, 5))), "transfer": linear_transfer()}
-    gradient = compiled(jax.grad(lambda p: lit(p["values"], normals, p["transfer"])))(p)
+    gradient = jax.jit(jax.grad(lambda p: lit(p["values"], normals, p["transfer"])))(p)
     flat, unravel = jax.flatten_util.ravel_pytree(p)
     of = lambda v: lit(unravel(v)["values"], normals, unravel(v)["transfer"], adjoint=jvr.Forward())
     h = 1e-6 * np.eye(flat.size)
-    above, below = jnp.split(compiled(lambda v: jax.lax.map(of, v, batch_size=32))(flat + np.concatenate([h, -h])), 2)
+    above, below = jnp.split(jax.jit(lambda v: jax.lax.map(of, v, batch_size=32))(flat + np.concatenate([h, -h])), 2)
     expected = unravel((above - below) / 2e-6)
     for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(gradient), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6 * np.abs(b).max(), err_msg=jax.tree_util.keystr(path))
@@ -258,12 +257,12 @@ def test_a_vanishing_gradient_has_no_normal_and_no_nan(scheme, threshold):
     values, transfer = jnp.full((4, 5, 6), 0.5), linear_transfer()
     normals = scheme()
     for shading in (jvr.BlinnPhong(threshold=threshold),):
-        value, gradient = compiled(jax.value_and_grad(lambda v, s=shading: lit(v, normals, transfer, s)))(values)
-        plain = compiled(lambda v: unlit(v, eqx.tree_at(lambda t: t.rgb, transfer, 0.7 * transfer.rgb)))(values)
+        value, gradient = jax.jit(jax.value_and_grad(lambda v, s=shading: lit(v, normals, transfer, s)))(values)
+        plain = jax.jit(lambda v: unlit(v, eqx.tree_at(lambda t: t.rgb, transfer, 0.7 * transfer.rgb)))(values)
         np.testing.assert_allclose(value, plain, rtol=1e-6)
         assert np.isfinite(gradient).all()
         forward = functools.partial(lit, normals=normals, transfer=transfer, shading=shading, adjoint=jvr.Forward())
-        tangent = compiled(lambda v, t, f=forward: jax.jvp(f, (v,), (t,))[1])(values, jnp.ones_like(values))
+        tangent = jax.jit(lambda v, t, f=forward: jax.jvp(f, (v,), (t,))[1])(values, jnp.ones_like(values))
         np.testing.assert_allclose(tangent, np.sum(gradient), rtol=1e-4)
 
 
@@ -336,11 +335,11 @@ def test_derivatives_of_a_transfer_of_the_gradient(kind, x64):
         rgb = jvr.render(scene, camera, jvr.Settings(0.7, termination=0, adjoint=adjoint)).rgb
         return jnp.sum(jnp.sin(jnp.arange(1.0, rgb.size + 1)).reshape(rgb.shape) * rgb)
 
-    gradient = compiled(jax.grad(lambda p: loss(p, jvr.Replay())))(p)
+    gradient = jax.jit(jax.grad(lambda p: loss(p, jvr.Replay())))(p)
     flat, unravel = jax.flatten_util.ravel_pytree(p)
     h = 1e-6 * np.eye(flat.size)
     of = lambda v: jax.lax.map(lambda x: loss(unravel(x), jvr.Forward()), v, batch_size=32)
-    above, below = jnp.split(compiled(of)(flat + np.concatenate([h, -h])), 2)
+    above, below = jnp.split(jax.jit(of)(flat + np.concatenate([h, -h])), 2)
     for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(unravel((above - below) / 2e-6)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6 * np.abs(b).max())
 

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import compiled
 from scipy.stats import chisquare
 
 from jvr.model.mie import Draine, JendersieEon, TabulatedPhase
@@ -327,9 +326,9 @@ def test_derivatives_of_a_table_are_those_of_finite_differences(x64):
 def test_derivatives_of_parameters_are_those_of_finite_differences(x64, name):
     angle = ScatteringAngle.of_cosine(jnp.linspace(-1.0, 1.0, 7))
     value = lambda x: FINITE[name](x).evaluate(angle)[0]
-    over, x = compiled(jax.vmap(value)), jnp.asarray([-0.6, 0.4])
+    over, x = jax.jit(jax.vmap(value)), jnp.asarray([-0.6, 0.4])
     differences = (over(x + 1e-6) - over(x - 1e-6)) / 2e-6
-    np.testing.assert_allclose(compiled(jax.vmap(jax.jacrev(value)))(x), differences, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.jacrev(value)))(x), differences, rtol=1e-6, atol=1e-9)
 
 
 ERRORS = {

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import compiled, gaussian_transfer, linear_transfer, lut_transfer
+from scenes import gaussian_transfer, linear_transfer, lut_transfer
 
 import jvr
 from jvr.model.preintegration import PreIntegratedTable
@@ -63,7 +63,7 @@ def all_models(table, s0, s1, dt, parts=1):
     return column(both[0][0]), column(both[1][0]), column(both[0][1]), column(both[2][1])
 
 
-_all_models = compiled(all_models, static_argnums=4)
+_all_models = jax.jit(all_models, static_argnums=4)
 
 
 def models(table, ends, parts=1):
@@ -77,7 +77,7 @@ def segment(table, s0, s1, dt, parts=1):
     return jnp.stack([*emitted, *dtau])
 
 
-@compiled
+@jax.jit
 @functools.partial(jax.vmap, in_axes=(None, 0, 0, 0))
 def _compiled_rows(*arguments):
     values, pull = jax.vjp(segment, *arguments)
@@ -159,7 +159,7 @@ def test_self_attenuation_has_order_four(x64):
     true, _, depth = quadrature(table, *ends)
     assert depth.max() > 1
     counts = np.array([2, 4, 6])
-    several = compiled(segment, static_argnums=4)
+    several = jax.jit(segment, static_argnums=4)
     errors = [np.abs(several(table, *(jnp.array(v) for v in ends), int(p))[:3] - true).max() for p in counts]
     order = -np.polyfit(np.log(counts), np.log(errors), 1)[0]
     assert abs(order - 4) < 0.3, (order, errors)
@@ -387,7 +387,7 @@ def test_forward_mode_is_reverse_mode(make, x64):
     arguments = (make(scale=2.0), *(jnp.asarray(v) for v in smooth_segments()))
     direction = jax.tree.map(lambda v: 0.1 * jnp.cos(3 * jnp.arange(v.size, dtype=v.dtype)).reshape(v.shape), arguments)
     several = jax.vmap(segment, (None, 0, 0, 0))
-    _, forward = compiled(functools.partial(jax.jvp, several))(arguments, direction)
+    _, forward = jax.jit(functools.partial(jax.jvp, several))(arguments, direction)
     _, rows = values_and_rows(arguments[0], arguments[1:])
     reverse = 0.0
     for path, d in jax.tree_util.tree_leaves_with_path(direction):

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference import _slabs, camera_rays
-from scenes import OBLIQUE, affine, compiled, linear_transfer, perspective, voxels
-from scenes import render_quickly as render
+from scenes import OBLIQUE, affine, linear_transfer, perspective, render, voxels
 
 import jvr
 from jvr.march import wavefront
@@ -197,7 +196,7 @@ def test_tiles_and_the_wavefront_change_nothing(monkeypatch):
 
     def both(width, tile):
         monkeypatch.setattr(wavefront, "WAVEFRONT", width)
-        (_, image), gradient = compiled(jax.value_and_grad(lambda v: loss(v, tile), has_aux=True))(volume.values)
+        (_, image), gradient = jax.jit(jax.value_and_grad(lambda v: loss(v, tile), has_aux=True))(volume.values)
         return image, gradient
 
     whole, gradient = both(1000, 1000)

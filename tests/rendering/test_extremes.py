@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import OBLIQUE, affine, compiled, gaussian_transfer, linear_transfer, perspective, voxels
+from scenes import OBLIQUE, affine, gaussian_transfer, linear_transfer, perspective, voxels
 
 import jvr
 
@@ -32,7 +32,7 @@ def _measure(inputs, rest):
     return image, jax.vmap(lambda c: pull(c)[0])(cotangents)
 
 
-_measured = compiled(_measure)
+_measured = jax.jit(_measure)
 _measured_as_users_do = jax.jit(_measure)
 
 
@@ -270,7 +270,7 @@ def test_entries_deep_behind_an_opaque_front_keep_their_digits(depth):
             np.testing.assert_allclose(g[counted], t[counted], rtol=1e-4, err_msg=f"d {output} / d {name}")
 
 
-@compiled
+@jax.jit
 def _scene_gradient(inputs, rest):
     return jax.value_and_grad(lambda i: jnp.sum(jvr.render(*eqx.combine(i, rest), SETTINGS).rgb))(inputs)
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import affine, compiled, linear_transfer, render_quickly
+from scenes import affine, linear_transfer, render
 
 import jvr
 from jvr.fitting.observations import observe, observed_medium, prepare_in_fit
@@ -50,10 +50,10 @@ def picture(arguments, *, gradients):
 
 
 def pixels(arrays, rest):
-    return render_quickly(*eqx.combine(arrays, rest), SETTINGS).rgb, ()
+    return render(*eqx.combine(arrays, rest), SETTINGS).rgb, ()
 
 
-@compiled
+@jax.jit
 def with_gradients(arrays, rest):
     def loss(arrays):
         rgb = jvr.render(*eqx.combine(arrays, rest), SETTINGS).rgb

@@ -9,7 +9,7 @@ import jax.monitoring
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import compiled, linear_transfer, perspective, small, voxels
+from scenes import linear_transfer, perspective, small, voxels
 
 import jvr
 
@@ -58,7 +58,7 @@ def test_another_step_compiles_nothing():
     before = len(compilations)
     coarse = jvr.render(base, camera, jvr.Settings(2.0))
     assert len(compilations) == before
-    fresh = compiled(lambda s, c: jvr.render(s, c, jvr.Settings(2.0)))(base, camera)
+    fresh = jax.jit(lambda s, c: jvr.render(s, c, jvr.Settings(2.0)))(base, camera)
     np.testing.assert_allclose(coarse.rgb, fresh.rgb, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(coarse.stats.steps, fresh.stats.steps)
 
@@ -110,7 +110,7 @@ def test_derivatives_that_are_not_compiled_are_one_program(case, what):
     again = derivative(other)
     assert not compilations
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(again))
-    expected = compiled(derivative)(value)
+    expected = jax.jit(derivative)(value)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * np.abs(b).max())
 
@@ -162,5 +162,5 @@ def test_under_vmap_a_sample_on_a_voxel_reads_that_voxel():
     scene, camera = small(), perspective(small().volume, 9, 5)
     alpha = lambda rgb: jvr.render(eqx.tree_at(lambda s: s.transfer.rgb, scene, rgb), camera).alpha
     both = jnp.stack([scene.transfer.rgb, 0.5 * scene.transfer.rgb])
-    one = compiled(alpha)(both[0])
-    np.testing.assert_allclose(compiled(jax.vmap(alpha))(both), jnp.stack([one, one]), atol=2e-6)
+    one = jax.jit(alpha)(both[0])
+    np.testing.assert_allclose(jax.jit(jax.vmap(alpha))(both), jnp.stack([one, one]), atol=2e-6)
