@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from jvr.model.by_value import ByValue as ByValue
     from jvr.model.camera import OrthographicCamera as OrthographicCamera
     from jvr.model.camera import PerspectiveCamera as PerspectiveCamera
+    from jvr.model.camera import PinholeCamera as PinholeCamera
     from jvr.model.camera import fibonacci_sphere as fibonacci_sphere
     from jvr.model.camera import orbit as orbit
     from jvr.model.clipping import ClippingBox as ClippingBox

@@ -35,7 +35,7 @@ NAMES = {
     "jvr.march.quadrature": ("Midpoint", "PreIntegrated"),
     "jvr.model.brdf": ("BlinnPhongBRDF", "LambertBRDF", "PhaseBRDF", "PhongBRDF"),
     "jvr.model.by_value": ("ByValue",),
-    "jvr.model.camera": ("OrthographicCamera", "PerspectiveCamera", "fibonacci_sphere", "orbit"),
+    "jvr.model.camera": ("OrthographicCamera", "PerspectiveCamera", "PinholeCamera", "fibonacci_sphere", "orbit"),
     "jvr.model.clipping": ("ClippingBox",),
     "jvr.model.dipole": ("Dipole",),
     "jvr.model.environment": ("EnvironmentLight",),

@@ -96,11 +96,48 @@ class PerspectiveCamera(AbstractCamera):
         return cls(pose, fov_y, width, height, remainder=remainder)
 
     def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
-        x, y = _plane(self, pixels, 2 * jnp.tan(jnp.deg2rad(self.fov_y) / 2))
-        norm = jnp.sqrt(x * x + y * y + 1)
-        direction = _rotate(self.world_from_camera, (x / norm, y / norm, -1 / norm))
-        aside = _rotate(self.world_from_camera, (ahead * x, ahead * y, jnp.zeros_like(x)))
-        return tuple(a + c for a, c in zip(aside, self.axis_at(ahead), strict=True)), direction, ahead * norm
+        return _through(self, *_plane(self, pixels, 2 * jnp.tan(jnp.deg2rad(self.fov_y) / 2)), ahead)
+
+
+class PinholeCamera(AbstractCamera):
+    """A pinhole camera as a calibration describes it: each axis has a focal length of its own, and the axis of view meets the picture
+    where it will.
+
+    The point (X, Y, Z) of its own frame, with Z < 0, is seen at column `c_x - f_x X / Z` and row `c_y + f_y Y / Z`, both counted in
+    pixels from the upper left corner of the picture, so that the centre of the first pixel is at (0.5, 0.5).
+
+    **Arguments:** `world_from_camera`: 4x4 rigid transform; `focal_lengths`: `(f_x, f_y)` in pixels; `principal_point`: `(c_x, c_y)` in
+    pixels, by default the middle of the picture; it may lie outside; `width`, `height`: pixels (static); `remainder`: of a pose that JAX
+    holds already. All arrays are differentiable. **Raises** `ValueError` for sizes below 1 and focal lengths that are not positive.
+    """
+
+    world_from_camera: Affine = parameter(doc="rigid transform")
+    focal_lengths: Float[Array, "2"] = parameter(POSITIVE, doc="along columns and rows", unit="pixels")
+    principal_point: Float[Array, "2"] = parameter(doc="column and row, from the upper left corner", unit="pixels")
+    width: int = pixels()
+    height: int = pixels()
+    remainder: Remainder = parameter(doc="what single precision leaves of the pose")
+
+    def __init__(
+        self,
+        world_from_camera: ArrayLike,
+        focal_lengths: ArrayLike,
+        width: int,
+        height: int,
+        *,
+        principal_point: ArrayLike | None = None,
+        remainder: Remainder | None = None,
+    ):
+        self.world_from_camera = affine(world_from_camera, "world_from_camera")
+        self.remainder = Remainder.left(world_from_camera, self.world_from_camera, remainder)
+        middle = (width / 2, height / 2) if principal_point is None else principal_point
+        assign(self, focal_lengths=focal_lengths, principal_point=middle, width=width, height=height)
+
+    def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
+        row, column = jnp.divmod(pixels, self.width)
+        x = (column + 0.5 - self.principal_point[0]) / self.focal_lengths[0]
+        y = (self.principal_point[1] - row - 0.5) / self.focal_lengths[1]
+        return _through(self, x, y, ahead)
 
 
 class OrthographicCamera(AbstractCamera):
@@ -217,6 +254,16 @@ def _around(center: ArrayLike, radius: ArrayLike, offsets: list[Any], up: Array,
         upward = jnp.where(jnp.abs(jnp.dot(jnp.asarray(offset), up)) > 0.999, jnp.roll(up, -1), up)
         cameras.append(PerspectiveCamera.look_at(center + radius * in_double(offset), center, upward, fov_y, width, height))
     return tuple(cameras)
+
+
+def _through(
+    camera: AbstractCamera, x: Float[Array, "rays"], y: Float[Array, "rays"], ahead: Scalar
+) -> tuple[Triple, Triple, Float[Array, "rays"]]:
+    """`rays_ahead` of rays from the eye through (x, y) of the plane at distance 1."""
+    norm = jnp.sqrt(x * x + y * y + 1)
+    direction = _rotate(camera.world_from_camera, (x / norm, y / norm, -1 / norm))
+    aside = _rotate(camera.world_from_camera, (ahead * x, ahead * y, jnp.zeros_like(x)))
+    return tuple(a + c for a, c in zip(aside, camera.axis_at(ahead), strict=True)), direction, ahead * norm
 
 
 def _plane(
