@@ -12,7 +12,7 @@ from scenes import render
 
 import jvr
 from jvr.io import kinds
-from jvr.io.config import build_scene, read_config
+from jvr.io.config import build_scene, build_settings, read_config
 from jvr.model.phase import ScatteringAngle
 
 PAGE = "CONTRIBUTING.md"
@@ -185,12 +185,16 @@ kind = "wrapped"
 wrap = { positions = [0, 1], values = [0.2, 0.4] }
 [scattering]
 phase = { kind = "linear-cosine", b = 0.6 }
+[settings]
+sampling = "maximum"
 """
 
 
 def test_they_are_read_from_a_configuration(added, tmp_path):
     (tmp_path / "a.toml").write_text(CONFIG)
-    found = build_scene(read_config(tmp_path / "a.toml"))
+    config = read_config(tmp_path / "a.toml")
+    assert build_settings(config) == jvr.Settings(sampling=added.MaximumProjection())
+    found = build_scene(config)
     assert isinstance(found.lights[0], added.PanelLight)
     assert [float(x) for x in (found.lights[0].intensity, found.scattering.phase.b, found.transfer.sigma_t)] == pytest.approx(
         TRUTH[:3]

@@ -8,7 +8,6 @@ emits, both 0 ... 1 for colours of 0 ... 1. No derivative goes through any of th
 """
 
 import abc
-import math
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -18,6 +17,8 @@ from jaxtyping import Array, Float, Int
 
 from jvr.model.bricks import bricks_of
 from jvr.model.optical import AbstractOpticalModel
+from jvr.model.parameters import assign, choice
+from jvr.model.ranges import POSITIVE
 from jvr.model.transfer import LinearTransfer, LutTransfer
 from jvr.model.volume import Volume
 from jvr.numerics import one_minus_exp, read_at
@@ -59,14 +60,10 @@ class Finest(AbstractOracle):
 
 
 class _Tolerant(AbstractOracle):
-    tolerance: float | int = eqx.field(static=True, default=0.01)
+    tolerance: float = choice(POSITIVE, doc="opacity and radiance of one voxel", hint="0.01 is a good start")
 
-    def __check_init__(self):
-        tolerance, name = self.tolerance, type(self).__name__
-        if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not 0 < tolerance < math.inf:
-            raise ValueError(
-                f"{name} tolerance must be a change of opacity or radiance above 0, not {tolerance!r}; 0.01 is a good start"
-            )
+    def __init__(self, tolerance: float | int = 0.01):
+        assign(self, tolerance=tolerance)
 
 
 class OpacityChange(_Tolerant):

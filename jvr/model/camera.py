@@ -11,15 +11,28 @@ from jaxtyping import Array, Float, Int
 
 from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder, in_double
-from jvr.model.parameters import assign, choice, parameter
-from jvr.model.ranges import ANGLE_OF_VIEW, AT_LEAST_ONE, POSITIVE
+from jvr.model.parameters import TRIPLE, arguments, assign, choice, parameter
+from jvr.model.ranges import ANGLE_OF_VIEW, AT_LEAST_ONE, DIRECTION, POSITIVE
 from jvr.numerics import normalise
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector
 
 
 def pixels() -> Any:
     """The declaration of the size of a picture."""
-    return choice(AT_LEAST_ONE, doc="pixels")
+    return choice(AT_LEAST_ONE, doc="pixels", most=65_536)
+
+
+def angle_of_view() -> Any:
+    """The declaration of a vertical angle of view."""
+    return parameter(ANGLE_OF_VIEW, doc="full vertical angle", unit="degrees")
+
+
+def around() -> dict[str, Any]:
+    """The declarations of the arguments of cameras that look inwards from all around."""
+    center = parameter(doc="x, y, z", unit="mm", shapes=TRIPLE)
+    radius = parameter(POSITIVE, doc="distance from the centre", unit="mm")
+    count = choice(AT_LEAST_ONE, doc="cameras", most=10_000)
+    return {"center": center, "radius": radius, "count": count, "fov_y": angle_of_view(), "width": pixels(), "height": pixels()}
 
 
 class AbstractCamera(eqx.Module):
@@ -69,7 +82,7 @@ class PerspectiveCamera(AbstractCamera):
     """
 
     world_from_camera: Affine = parameter(doc="rigid transform")
-    fov_y: Scalar = parameter(ANGLE_OF_VIEW, doc="full vertical angle", unit="degrees")
+    fov_y: Scalar = angle_of_view()
     width: int = pixels()
     height: int = pixels()
     remainder: Remainder = parameter(doc="what single precision leaves of the pose")
@@ -219,6 +232,7 @@ def _axes(eye: Exact, target: Exact, up: Vector) -> tuple[Vector, Vector, Affine
     return back, side, pose, low
 
 
+@arguments(**around(), axis=parameter(DIRECTION, doc="x, y, z; what is up in every picture", shapes=TRIPLE))
 def orbit(
     center: ArrayLike, radius: ArrayLike, count: int, fov_y: ArrayLike, width: int, height: int, *, axis: ArrayLike = (0, 0, 1)
 ) -> tuple[PerspectiveCamera, ...]:
@@ -232,6 +246,7 @@ def orbit(
     return _around(center, radius, offsets, axis, fov_y, width, height)
 
 
+@arguments(**around())
 def fibonacci_sphere(
     center: ArrayLike, radius: ArrayLike, count: int, fov_y: ArrayLike, width: int, height: int
 ) -> tuple[PerspectiveCamera, ...]:
@@ -245,9 +260,6 @@ def fibonacci_sphere(
 
 
 def _around(center: ArrayLike, radius: ArrayLike, offsets: list[Any], up: Array, fov_y: ArrayLike, width: int, height: int):
-    if not offsets:
-        raise ValueError("count must be at least 1")
-    float_array(center, "center", (3,))
     center, radius, cameras = in_double(center), in_double(radius), []
     for offset in offsets:
         # At the poles of the sphere z cannot point up in the picture; y then does.

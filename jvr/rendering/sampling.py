@@ -1,14 +1,15 @@
 """Which samples a picture is made of: the choices that `Settings(sampling=...)` takes."""
 
 import abc
-import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Int
 
 from jvr.march.oracle import AbstractOracle, LocalError
+from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import AbstractPart, PlanEntry
+from jvr.model.ranges import NOT_NEGATIVE, Interval
 
 if TYPE_CHECKING:
     # What renders knows the settings, which know this.
@@ -60,18 +61,11 @@ class Slices(AbstractSampling):
     and pixels apart, 0 ... 5; 0 leaves none out. **Raises** `ValueError` for levels out of range.
     """
 
-    oracle: AbstractOracle
-    levels: int = eqx.field(static=True)
+    oracle: AbstractOracle = parameter(doc="jvr.LocalError(), jvr.OpacityChange(), jvr.BrickRange() or jvr.Finest()")
+    levels: int = choice(Interval(0.0, 5.0), doc="samples are up to 2^levels slices and pixels apart")
 
     def __init__(self, oracle: AbstractOracle = LocalError(), *, levels: int = 3):
-        if not isinstance(oracle, AbstractOracle):
-            raise TypeError(
-                f"oracle must be jvr.LocalError(), jvr.OpacityChange(), jvr.BrickRange() or jvr.Finest(), not {oracle!r}"
-            )
-        if isinstance(levels, bool) or not isinstance(levels, int) or not 0 <= levels <= 5:
-            raise ValueError(f"Slices levels must be a whole number from 0 (every sample) to 5 (32 slices apart), not {levels!r}")
-        self.oracle = oracle
-        self.levels = levels
+        assign(self, oracle=oracle, levels=levels)
 
     @property
     def explanation(self) -> str:
@@ -93,16 +87,13 @@ class Refinement(AbstractSampling):
     values out of range.
     """
 
-    tolerance: float = eqx.field(static=True)
-    tile: int = eqx.field(static=True)
+    tolerance: float = choice(NOT_NEGATIVE, doc="radiance and opacity, 0 for every ray", hint="0.005 is a good start")
+    tile: int = choice(Interval(2.0, 64.0), doc="pixels from one ray of the coarsest grid to the next", hint="8 is a good start")
 
     def __init__(self, tolerance: float | int = 0.005, *, tile: int = 8):
-        if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not 0 <= tolerance < math.inf:
-            raise ValueError(f"Refinement tolerance must be a radiance, 0 or more, not {tolerance!r}; 0.005 is a good start")
-        if isinstance(tile, bool) or tile not in TILES:
-            raise ValueError(f"Refinement tile must be a power of two from 2 to 64 pixels, not {tile!r}; 8 is a good start")
-        self.tolerance = float(tolerance)
-        self.tile = tile
+        assign(self, tolerance=tolerance, tile=tile)
+        if tile not in TILES:
+            raise ValueError(f"tile must be a power of two from 2 to 64 pixels, not {tile!r}; 8 is a good start")
 
     @property
     def explanation(self) -> str:

@@ -482,14 +482,14 @@ def test_what_slices_cannot_render_is_refused():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: jvr.Slices(levels=6), "from 0 .* to 5"),
-        (lambda: jvr.Slices(levels=True), "from 0 .* to 5"),
-        (lambda: jvr.OpacityChange(-0.1), "OpacityChange tolerance must be .* above 0"),
-        (lambda: jvr.BrickRange(0), "above 0"),
-        (lambda: jvr.LocalError(float("nan")), "above 0"),
+        (lambda: jvr.Slices(levels=6), "from 0 to 5"),
+        (lambda: jvr.Slices(levels=-1), "from 0 to 5"),
+        (lambda: jvr.OpacityChange(-0.1), "tolerance must be positive and finite .*; 0.01 is a good start"),
+        (lambda: jvr.BrickRange(0), "positive"),
+        (lambda: jvr.LocalError(float("nan")), "positive"),
         (lambda: jvr.Refinement(tile=6), "power of two from 2 to 64"),
-        (lambda: jvr.Refinement(-1), "0 or more"),
-        (lambda: jvr.Refinement(float("nan")), "0 or more"),
+        (lambda: jvr.Refinement(-1), "not negative"),
+        (lambda: jvr.Refinement(float("nan")), "not negative"),
     ],
 )
 def test_values_out_of_range_are_refused(make, message):
