@@ -89,7 +89,7 @@ def test_gradients_in_everything(name, by):
 
 
 @slow
-@pytest.mark.parametrize("adjoint", [jvr.Forward(), jvr.Rows()])
+@pytest.mark.parametrize("adjoint", [jvr.Replay(), jvr.Forward(), jvr.Rows()])
 def test_tangents(adjoint):
     scene, camera = plain(), perspective(plain().volume, 9, 5)
     of = lambda sigma: (

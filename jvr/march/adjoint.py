@@ -24,9 +24,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jvr.march.linear import linear
 from jvr.march.march import Marched, MarchOptions, ReplayRecord, integrate, march
-from jvr.march.medium import Medium, for_derivatives
-from jvr.march.rules import is_zero, skipping, wanted_and_fixed, with_zeros
+from jvr.march.medium import Medium, for_derivatives, taking_all
+from jvr.march.rules import FORWARDS, is_there, perturbed, skipping
 from jvr.march.segments import ActiveRays, SegmentBatch, active_rays, node_points, occupied_count, resample, with_lighting
 from jvr.march.steps import Rays, Sample, points_at, segment_span
 from jvr.march.sums import opacity, through, transmittance
@@ -34,37 +35,49 @@ from jvr.march.wavefront import wavefront_while
 from jvr.numerics import materialise, one_minus_exp, two_sum
 from jvr.types import Channels, Scalar
 
-# What a derivative of a gradient is taken by.
-FORWARDS = (
-    "second derivatives are taken forwards: use jax.jvp(jax.grad(loss), (x,), (v,)) in place of a gradient of jax.grad(loss)"
-)
+Inputs = tuple[Medium, Rays, Scalar]
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def replay_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def replay_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Any:
+    """`march` with reverse mode, and forward mode at the cost of a march more than that of `march` itself."""
     return march(options, medium, rays, dt)
 
 
-def _replay_forward(options: MarchOptions, *arguments: Any):
-    wanted, fixed = wanted_and_fixed(arguments)
-    gathered, record = _integrate(options, *eqx.combine(wanted, fixed))
-    return gathered, (wanted, fixed, record)
+def _derivative(options: MarchOptions, inputs: Inputs, tangents: Any) -> tuple[Marched, Marched]:
+    tangents = perturbed(inputs, tangents)
+    gathered, record = _integrate(options, *inputs)
+    forward, backward = functools.partial(_forward, options), functools.partial(_backward, is_there(tangents))
+    tangent = linear(forward, backward, (inputs, record), tangents, like=gathered._replace(steps=None))
+    steps: Any = jax.custom_derivatives.zero_from_primal(gathered.steps, symbolic_zeros=True)
+    return gathered, tangent._replace(steps=steps)
 
 
-def _replay_backward(options: MarchOptions, residuals: Any, cotangent: Marched):
-    if all(map(is_zero, cotangent.distance)):
+def _forward(options: MarchOptions, residuals: tuple[Inputs, Any], tangents: Any) -> Marched:
+    """The derivative of the march along `tangents`."""
+    moving, fixed = eqx.partition(residuals[0], is_there(tangents))
+
+    def along(moving: Any) -> Marched:
+        medium, rays, dt = eqx.combine(moving, fixed)
+        return march(options, taking_all(medium), rays, dt)._replace(steps=None)
+
+    return jax.jvp(along, (moving,), (tangents,))[1]
+
+
+def _backward(wanted: Any, residuals: tuple[Inputs, Any], cotangent: Marched) -> Any:
+    """The gradient in what is `wanted`, by replay."""
+    inputs, record = residuals
+    if all(g is None for g in cotangent.distance):
         # Nobody asks for the derivative of the distance: it is then not replayed either.
         cotangent = cotangent._replace(distance=())
-    wanted, fixed, record = residuals
-    return _replay(None, wanted, fixed, record, with_zeros(cotangent)._replace(steps=None))
+    zero = jnp.zeros_like(inputs[1].length)
+    cotangent = jax.tree.map(lambda g: zero if g is None else g, cotangent, is_leaf=lambda g: g is None)
+    return _replay(None, *eqx.partition(inputs, wanted), record, cotangent._replace(steps=None))
 
 
 _integrate = skipping(functools.partial(integrate, for_replay=True), FORWARDS)
 _replay = skipping(lambda _, *arguments: replay(*arguments), FORWARDS)
-replay_march.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
-
-
-Inputs = tuple[Medium, Rays, Scalar]
+replay_march.defjvp(_derivative, symbolic_zeros=True)
 
 
 class SuffixRadiance(NamedTuple):
@@ -233,8 +246,3 @@ def _no_taps(medium: Medium, rays: Rays) -> tuple[Sample, ...]:
     points = points_at(rays, jnp.zeros_like(rays.length, jnp.int32), jnp.int32(0), rays.length)
     one = jax.eval_shape(lambda: jax.vmap(medium.field.resample)(points))
     return (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one),) * len(medium.shader.quadrature_nodes)
-
-
-def is_there(tree: Any) -> Any:
-    """Which leaves of a tree are not `None`."""
-    return jax.tree.map(lambda leaf: leaf is not None, tree, is_leaf=lambda leaf: leaf is None)

@@ -8,11 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jvr.march.adjoint import FORWARDS, Inputs, is_there, replay_march
+from jvr.march.adjoint import Inputs, replay_march
 from jvr.march.jacobian import TableJacobian, table_jacobian
 from jvr.march.march import Marched, MarchOptions, march
 from jvr.march.medium import Medium, taking_all
-from jvr.march.rules import forwards_only, is_zero, skipping
+from jvr.march.rules import FORWARDS, forwards_only, is_there, perturbed, skipping
 from jvr.march.steps import Rays
 from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.transfer import AbstractTable, AbstractTransfer
@@ -68,8 +68,7 @@ def _jacobian_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scala
 
 
 def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[Marched, Marched]:
-    perturbed = jax.tree.map(lambda t, x: not is_zero(t) and eqx.is_inexact_array(x), tangents, primals, is_leaf=is_zero)
-    tangents = eqx.filter(tangents, perturbed)
+    tangents = perturbed(primals, tangents)
     medium, rays, dt = primals
     if jax.tree.leaves(tangents[0].shadows):
         raise ValueError(

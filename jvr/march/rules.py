@@ -14,6 +14,11 @@ from jvr.march.medium import showing_all
 
 Tree = TypeVar("Tree")
 
+# What a derivative of a gradient is taken by.
+FORWARDS = (
+    "second derivatives are taken forwards: use jax.jvp(jax.grad(loss), (x,), (v,)) in place of a gradient of jax.grad(loss)"
+)
+
 
 def is_zero(x: Any) -> bool:
     """Whether a tangent or cotangent is known to be zero."""
@@ -37,6 +42,17 @@ def wanted_and_fixed(arguments: Any) -> tuple[Any, Any]:
     return eqx.partition(values(arguments), perturbed)
 
 
+def perturbed(primals: Any, tangents: Any) -> Any:
+    """The tangents that a rule is given, without those that are known to be zero."""
+    moves = jax.tree.map(lambda t, x: not is_zero(t) and _is_inexact(x), tangents, primals, is_leaf=is_zero)
+    return eqx.filter(tangents, moves)
+
+
+def is_there(tree: Any) -> Any:
+    """Which leaves of a tree are not `None`."""
+    return jax.tree.map(lambda leaf: leaf is not None, tree, is_leaf=lambda leaf: leaf is None)
+
+
 def skipping(function: Callable[..., Tree], remedy: str) -> Callable[..., Tree]:
     """`function(options, *arguments)`, which skips empty bricks of the media among its arguments, and not where it is differentiated:
     what is empty adds nothing to a value and may well have a derivative. Those are of forward mode; reverse mode is refused, with the
@@ -47,10 +63,10 @@ def skipping(function: Callable[..., Tree], remedy: str) -> Callable[..., Tree]:
         return function(options, *arguments)
 
     def rule(options: Any, primals: Any, tangents: Any) -> tuple[Tree, Tree]:
-        moves = jax.tree.map(lambda t, x: not is_zero(t) and _is_inexact(x), tangents, primals, is_leaf=is_zero)
-        moving, still = eqx.partition(primals, moves)
+        tangents = perturbed(primals, tangents)
+        moving, still = eqx.partition(primals, is_there(tangents))
         along = lambda moving: function(options, *showing_all(eqx.combine(moving, still)))
-        primal, tangent = jax.jvp(along, (moving,), (eqx.filter(tangents, moves),))
+        primal, tangent = jax.jvp(along, (moving,), (tangents,))
         return primal, forwards_only(tangent, remedy)
 
     call.defjvp(rule, symbolic_zeros=True)

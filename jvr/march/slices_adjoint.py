@@ -20,11 +20,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jvr.march.adjoint import is_there
 from jvr.march.compact import accumulate, for_each
 from jvr.march.fields import VoxelField
 from jvr.march.march import Marched
-from jvr.march.rules import values, wanted_and_fixed, with_zeros
+from jvr.march.rules import is_there, values, wanted_and_fixed, with_zeros
 from jvr.march.slices import (
     End,
     Gathered,

@@ -338,8 +338,12 @@ def test_replay_against_forward_mode(method, x64):
     p, shadows = parameters(), SHADOWS[method]
     reverse = jax.jit(jax.grad(lambda p: loss(p, shadows, jvr.Replay())))(p)
     forward = jax.jit(jax.jacfwd(lambda p: loss(p, shadows, jvr.Forward())))(p)
-    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(reverse), jax.tree.leaves(forward), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=ROUNDING * np.abs(b).max(), err_msg=jax.tree_util.keystr(path))
+    both = jax.jit(jax.jacfwd(lambda p: loss(p, shadows, jvr.Replay())))(p)
+    for (path, b), *others in zip(
+        jax.tree_util.tree_leaves_with_path(forward), *map(jax.tree.leaves, (reverse, both)), strict=True
+    ):
+        for a in others:
+            np.testing.assert_allclose(a, b, rtol=0, atol=ROUNDING * np.abs(b).max(), err_msg=jax.tree_util.keystr(path))
 
 
 @pytest.mark.slow

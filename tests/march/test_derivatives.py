@@ -208,11 +208,41 @@ def test_rows_of_a_table(kind, termination, x64):
     assert max(np.abs(x).max() for x in jax.tree.leaves(expected)) > 0.1
 
 
+# What goes through forward mode on its way to a gradient: transposed, batched, or made anew.
+FORWARDS_AND_BACK = {
+    "jacfwd": jax.jacfwd,
+    "linearize": lambda loss: lambda p: jax.linear_transpose(jax.linearize(loss, p)[1], p)(1.0)[0],
+    "checkpoint": lambda loss: jax.grad(jax.checkpoint(loss)),
+    "checkpoint of vmap": lambda loss: jax.grad(jax.checkpoint(lambda p: jnp.mean(jax.vmap(loss)(each(p))))),
+    "checkpoint of vmap, shared": lambda loss: jax.grad(
+        jax.checkpoint(lambda p: jnp.mean(jax.vmap(lambda b: loss(p | {"background": b}))(each(p)["background"])))
+    ),
+    "scan of checkpoint": lambda loss: jax.grad(
+        lambda p: jnp.mean(jax.lax.scan(jax.checkpoint(lambda _, p: (None, loss(p))), None, each(p))[1])
+    ),
+}
+
+
+def each(p):
+    """A batch of two that are the same."""
+    return jax.tree.map(lambda x: jnp.stack([x, x]), p)
+
+
+@pytest.mark.parametrize(
+    "way",
+    [w if w in ("jacfwd", "checkpoint of vmap, shared") else pytest.param(w, marks=pytest.mark.slow) for w in FORWARDS_AND_BACK],
+)
+def test_one_rule_for_both_modes(way, x64):
+    p = parameters(TRANSFERS["table"]())
+    names = ("transfer", "background") if way == "jacfwd" else ("transfer", "background", "voxels", "eye")
+    loss = make_loss({k: v for k, v in p.items() if k not in names}, jvr.Replay())
+    moving = {k: p[k] for k in names}
+    agree(jax.jit(FORWARDS_AND_BACK[way](loss))(moving), jax.jit(jax.grad(loss))(moving), ROUNDING)
+
+
 def test_modes_that_a_way_does_not_have_are_refused(x64):
     p = parameters(TRANSFERS["linear"]())
     moving = {"background": p["background"], "transfer": p["transfer"]}
-    with pytest.raises(TypeError, match="forward-mode"):
-        jax.eval_shape(jax.jacfwd(make_loss(p, jvr.Replay())), moving)
     with pytest.raises(ValueError, match=r"jvr.Forward\(\) has no reverse mode"):
         jax.eval_shape(jax.grad(make_loss(p, jvr.Forward())), moving)
 

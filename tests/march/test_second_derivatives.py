@@ -84,8 +84,9 @@ def test_the_gradient_in_colours_along_extinctions_that_are_zero(adjoint, x64):
     close(product(sigma_t), differences(jax.jit(gradient), sigma_t, along))
 
 
-def test_forward_mode_twice(x64):
-    loss, start, along = make_loss("table", jvr.Forward())
+@pytest.mark.parametrize("adjoint", [jvr.Forward(), jvr.Replay()])
+def test_forward_mode_twice(adjoint, x64):
+    loss, start, along = make_loss("table", adjoint)
     slope = lambda x: jax.jvp(loss, (x,), (along,))[1]
     twice = jax.jit(lambda x: jax.jvp(slope, (x,), (along,))[1])
     close(twice(start), differences(jax.jit(slope), start, along))
@@ -97,6 +98,12 @@ def test_reverse_mode_twice_is_refused_with_what_to_use(adjoint):
     along = lambda x: sum(jnp.vdot(g, v) for g, v in zip(jax.grad(loss)(x), start, strict=True))
     with pytest.raises(ValueError, match=r"use jax.jvp\(jax.grad\(loss\), \(x,\), \(v,\)\)"):
         jax.eval_shape(jax.grad(along), start)
+
+
+def test_reverse_mode_through_forward_mode_is_refused_with_what_to_use():
+    loss, start, _ = make_loss("table", jvr.Replay(), depth=False)
+    with pytest.raises(ValueError, match=r"use jax.jvp\(jax.grad\(loss\), \(x,\), \(v,\)\)"):
+        jax.eval_shape(jax.grad(lambda x: jax.jvp(loss, (x,), (start,))[1]), start)
 
 
 def test_forward_mode_has_no_gradient_to_differentiate():
