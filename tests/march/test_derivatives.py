@@ -215,7 +215,7 @@ FORWARDS_AND_BACK = {
     "checkpoint": lambda loss: jax.grad(jax.checkpoint(loss)),
     "checkpoint of vmap": lambda loss: jax.grad(jax.checkpoint(lambda p: jnp.mean(jax.vmap(loss)(each(p))))),
     "checkpoint of vmap, shared": lambda loss: jax.grad(
-        jax.checkpoint(lambda p: jnp.mean(jax.vmap(lambda b: loss(p | {"background": b}))(each(p)["background"])))
+        jax.checkpoint(lambda p: jnp.mean(jax.vmap(lambda eye: loss(p | {"eye": eye}))(each(p)["eye"])))
     ),
     "scan of checkpoint": lambda loss: jax.grad(
         lambda p: jnp.mean(jax.lax.scan(jax.checkpoint(lambda _, p: (None, loss(p))), None, each(p))[1])

@@ -230,7 +230,7 @@ def test_the_jacobian_is_the_same(x64):
 def test_forward_derivative_of_a_shadow_takes_empty_space_as_well(x64):
     """A medium of no extinction casts a shadow as soon as it has some; against float64 differences."""
     values = np.linspace(0, 1, 6)[:, None, None] * np.ones((6, 6, 6))
-    volume, camera = jvr.Volume(values), perspective(jvr.Volume(values), 4, 4, direction=(0.0, -1.0, 0.2))
+    volume, camera = jvr.Volume(values).bricked(1), perspective(jvr.Volume(values), 4, 4, direction=(0.0, -1.0, 0.2))
     scene = jvr.Scene(
         volume,
         jvr.LinearTransfer([0.0, 0.5, 1.0], np.full((3, 3), 0.8), [0.0, 0.0, 0.9]),
