@@ -8,11 +8,15 @@ import equinox as eqx
 
 from jvr.model.light import AbstractLight
 from jvr.model.parts import AbstractPart, PlanEntry, spelling
+from jvr.names import Renamed
 from jvr.types import Channels, Scalar, Triple
 
 
 class AbstractShading(AbstractPart):
     """Local shading: how a surface reflects light."""
+
+    ambient_share, surface_share = Renamed("ambient_reflectance"), Renamed("surface_weight")
+    gloss = Renamed("specular_lobe")
 
     @property
     def needs_gradient(self) -> bool:
@@ -45,6 +49,8 @@ class AbstractShading(AbstractPart):
 class AbstractScattering(AbstractPart):
     """Single scattering: how the medium scatters light."""
 
+    share = Renamed("medium_weight")
+
     @property
     @abc.abstractmethod
     def needs_gradient(self) -> bool:
@@ -76,6 +82,8 @@ class AbstractScattering(AbstractPart):
 
 class AbstractShadows(AbstractPart):
     """A shadow algorithm: a way to find the transmittance between lights and points."""
+
+    prepared = Renamed("visibility")
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         casting = sum(isinstance(light, AbstractLight) and light.casts_shadows for light in scene.lights)
@@ -127,6 +135,8 @@ class AbstractRadianceTransfer(AbstractPart):
     bleeding: eqx.AbstractVar[Any]
     # Highest order of its harmonics.
     order: eqx.AbstractVar[int]
+
+    outdated, made_for = Renamed("stale"), Renamed("cache_key")
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         made = "computed beforehand" if self.is_frozen else "computed in each picture: jvr.precompute"
