@@ -18,7 +18,7 @@ def residuals(
 ) -> Float[Array, "cameras height width 3"] | list[Float[Array, "height width 3"]]:
     """Rendered minus target, `(cameras, height, width, 3)`, or a list of images where sizes differ.
 
-    Differentiable as `jvr.render`, in the mode of `settings.adjoint`: `Replay()` for gradients, `Rows()` for Jacobians.
+    Differentiable as `jvr.render`; `settings.adjoint` says what is fast: `Replay()` gradients, `Rows()` Jacobians.
     **Raises** `ValueError` where the images do not fit the cameras.
     """
     targets = check_images(cameras, images)

@@ -13,7 +13,8 @@ march records, for each channel, the depth in front of the last segment that can
 
 What a segment's `e` and `dtau` depend on is left to automatic differentiation of that one segment.
 
-Second derivatives are those of both walks in forward mode (`jax.jvp` of `jax.grad`), in which nothing is stored either.
+The march is a `custom_jvp` whose tangent is one linear operation (`jvr.march.linear`): the march in forward mode, or transposed, the
+replay. Second derivatives are those of both walks in forward mode (`jax.jvp` of `jax.grad`), in which nothing is stored either.
 """
 
 import functools

@@ -31,10 +31,10 @@ class AbstractAdjoint(AbstractPart):
 
 
 class Replay(AbstractAdjoint):
-    """Reverse mode by replay, for any number of unknowns: memory does not grow with the number of steps. The default.
+    """Reverse mode by replay, for any number of unknowns, and forward mode: memory does not grow with the number of steps. The default.
 
-    JAX refuses forward mode (`jvp`, `jacfwd`) through it: use `Forward()`, or `Rows()` for few unknowns. Second derivatives are taken
-    forwards, `jax.jvp(jax.grad(loss), (x,), (v,))`; a gradient of `jax.grad(loss)` raises `ValueError`.
+    A tangent costs a march more than under `Forward()`. Second derivatives are taken forwards, `jax.jvp(jax.grad(loss), (x,), (v,))`; a
+    gradient of `jax.grad(loss)`, or of a `jvp`, raises `ValueError`.
     """
 
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
@@ -42,8 +42,8 @@ class Replay(AbstractAdjoint):
 
 
 class Forward(AbstractAdjoint):
-    """Forward mode (`jvp`, `jacfwd`, any number of times), for one or few directions; takes every sample that is not negligible. Reverse
-    mode through it raises `ValueError`: use `Replay()`."""
+    """Forward mode (`jvp`, `jacfwd`, any number of times), for one or few directions, at less cost than `Replay()`; takes every sample
+    that is not negligible. Reverse mode through it raises `ValueError`: use `Replay()`."""
 
     def march(self, options: MarchOptions, medium: Medium, rays: Rays, dt: Scalar) -> Marched:
         remedy = "jvr.Forward() has no reverse mode: use Settings(adjoint=jvr.Replay()), or jvr.Rows() for few unknowns"

@@ -33,7 +33,7 @@ class Settings(AbstractPart):
       small that a whole ray through the volume would gather less. A pixel changes by at most this times the brightest radiance, and
       so does `sigma_t` times the derivative in `sigma_t`; every evaluation looks anew. An extinction of zero then has the derivative
       zero where a brick has nothing else. 0 leaves out nothing that has a derivative.
-    - `adjoint`: how derivatives are computed: `jvr.Replay()` (reverse mode, default), `jvr.Forward()` or `jvr.Rows()`.
+    - `adjoint`: how derivatives are computed: `jvr.Replay()` (both modes, default), `jvr.Forward()` or `jvr.Rows()`.
     - `sampling`: which samples are taken: `jvr.Uniform()` (default: all), `jvr.Refinement()` or `jvr.Slices()`.
     - `tile`: rays marched at a time. Memory is about 120 bytes a ray; smaller tiles need less and take longer.
 
