@@ -6,7 +6,6 @@ from typing import Any
 
 import equinox as eqx
 
-from jvr.model.light import AbstractLight
 from jvr.model.parts import AbstractPart, PlanEntry, spelling
 from jvr.types import Channels, Scalar, Triple
 
@@ -78,16 +77,16 @@ class AbstractShadows(AbstractPart):
     """A shadow algorithm: a way to find the transmittance between lights and points."""
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        casting = sum(isinstance(light, AbstractLight) and light.casts_shadows for light in scene.lights)
+        casting = sum(light is not None for light in scene.shadow_casters)
         return (PlanEntry(name, True, f"{spelling(self)} for {casting} light{'s' * (casting != 1)}", ("light march",)),)
 
     def without(self, scene: Any) -> Any:
         return scene.replaced(shadows=None)
 
     @abc.abstractmethod
-    def visibility(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
-        """A `jvr.march.medium.AbstractVisibility` of these lights, made once for a picture; differentiable. `medium`: what light passes
-        through, a `jvr.march.medium.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""
+    def visibility(self, scene: Any, medium: Any, spacing: Scalar) -> Any:
+        """A `jvr.march.medium.AbstractVisibility` of the scene's lights, made once for a picture; differentiable. `medium`: what light
+        passes through, a `jvr.march.medium.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""
 
 
 class AbstractMaterial(AbstractPart):

@@ -12,12 +12,11 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from jvr.march.fields import VoxelField
-from jvr.march.medium import DENSEST, AbstractShader, AbstractVisibility, Medium
+from jvr.march.medium import DENSEST, AbstractShader, AbstractVisibility, Medium, Visibilities
 from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.quadrature import PreIntegrated
 from jvr.march.shaders import GradientFrame, LightPathShader, OpticalShader, PreIntegratedShader
 from jvr.model.bricks import bricks_of
-from jvr.model.light import AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbsorptionOnly
 from jvr.model.preintegration import PreIntegratedTable
@@ -62,12 +61,10 @@ def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool,
     from jvr.effects.lighting import LitPreIntegratedShader, LitShader
 
     kind = LitPreIntegratedShader if pre_integrated else LitShader
-    ambient = tuple(light for light in scene.lights if isinstance(light, AmbientLight))
-    lights, volume = delta_lights(scene), scene.volume
-    cut = None
+    cut, volume = None, scene.volume
     if scene.clipping is not None and frame is not None:
         cut = CutFaces(scene.clipping, jnp.min(volume.spacing))
-    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering, cut, environment)
+    return kind(scene.optical, frame, volume.world_from_grid, scene.lights, scene.shading, scene.scattering, cut, environment)
 
 
 def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
@@ -82,25 +79,20 @@ def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | No
     return GradientFrame(eqx.filter(normals, False), volume.axes_inverse, volume.intercept, volume.shape), normals
 
 
-def delta_lights(scene: Scene) -> tuple[AbstractLight, ...]:
-    """The lights that come from one direction at each point (delta lights)."""
-    return tuple(light for light in scene.lights if isinstance(light, AbstractLight))
-
-
 def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility | None:
     """What says how much light reaches a point, or `None` where nothing is in its way. Made once for a picture."""
     if scene.shadows is None and scene.radiance_transfer is None:
         return None
-    shadows = None
+    found = []
     if scene.shadows is not None:
         medium = absorbing(scene, occupancy, scene.transfer.takes_gradient)
-        shadows = scene.shadows.visibility(scene, delta_lights(scene), medium, jnp.min(scene.volume.spacing))
-    if scene.radiance_transfer is None:
-        return shadows
-    from jvr.effects.radiance_transfer_grid import radiance_transfer_visibility
+        found.append(scene.shadows.visibility(scene, medium, jnp.min(scene.volume.spacing)))
+    if scene.radiance_transfer is not None:
+        from jvr.effects.radiance_transfer_grid import radiance_transfer_visibility
 
-    medium = absorbing(scene, occupancy, scene.transfer.takes_gradient or scene.radiance_transfer.rays_need_gradient)
-    return radiance_transfer_visibility(scene, medium, shadows, len(delta_lights(scene)))
+        medium = absorbing(scene, occupancy, scene.transfer.takes_gradient or scene.radiance_transfer.rays_need_gradient)
+        found.append(radiance_transfer_visibility(scene, medium))
+    return Visibilities(tuple(found)) if len(found) > 1 else found[0]
 
 
 def absorbing(scene: Scene, occupancy: Occupancy | None, graded: bool) -> Medium:
