@@ -24,14 +24,19 @@ from docs import reference
 from jvr import cli
 from jvr.cli.app import app
 from jvr.io.config import build_fit, build_scene, config_from
-from jvr.io.config.schema.parts import BASES, WRITTEN, PartTable, table_of
-from jvr.io.kinds import KINDS, class_named
+from jvr.io.config.schema.parts import kinds_of, table_for
+from jvr.march.differentiation import AbstractAdjoint
+from jvr.march.oracle import AbstractOracle
+from jvr.march.quadrature import AbstractQuadrature
+from jvr.model.camera import AbstractCamera
 from jvr.model.effects import AbstractShading, AbstractShadows
+from jvr.model.environment import EnvironmentLight
 from jvr.model.light import AbstractEmitter
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
 from jvr.model.phase import AbstractPhase
 from jvr.names import NAMES
+from jvr.rendering.sampling import AbstractSampling
 
 PUBLIC = {name for names in NAMES.values() for name in names}
 LANGUAGES = {"python", "sh", "toml", "math", "bibtex"}
@@ -163,6 +168,12 @@ FAMILIES = {
     "[scattering.phase]": AbstractPhase,
     "[normals]": AbstractNormals,
     "[material]": AbstractBRDF,
+    "[environment]": EnvironmentLight,
+    "[camera]": AbstractCamera,
+    "[settings.quadrature]": AbstractQuadrature,
+    "[settings.adjoint]": AbstractAdjoint,
+    "[settings.sampling]": AbstractSampling,
+    "[settings.sampling.oracle]": AbstractOracle,
 }
 
 
@@ -175,9 +186,8 @@ def test_the_table_of_a_configuration_has_all_kinds_and_keys(section):
         if here and len(cells) == 2 and (kinds := re.findall(r"`([\w-]+)`", cells[0])):
             names |= set(kinds)
             keys |= set(re.findall(r"`(\w+)`", cells[1]))
-    written = WRITTEN.get(family, {})
-    tables = [*written.values(), *(table_of(class_named(name), BASES.get(family, PartTable)) for name in KINDS[family].values())]
-    assert names == {*KINDS[family], *written}
+    tables = [table_for(family, kind) for kind in kinds_of(family)]
+    assert names == set(kinds_of(family))
     assert keys - names == {key for table in tables for key in table.model_fields} - {"kind"} - names
 
 

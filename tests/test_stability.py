@@ -17,7 +17,7 @@ GRADIENT = 1e-3
 
 @pytest.mark.slow
 def test_hard_cases():
-    result = stability.table(quick=True, jit=jax.jit)
+    result = stability.table(quick=True)
     assert len(result) > 15
     for row in result:
         assert not row["not finite"], row
@@ -28,7 +28,7 @@ def test_hard_cases():
 @pytest.mark.slow
 def test_an_opaque_medium_keeps_its_digits():
     """Depth 0, 1e-3, 1e4 to the eye and to both lights."""
-    ways = stability.compiled_ways(jax.jit)
+    ways = stability.compiled_ways()
     (cases,) = list(stability.rows(quick=True).values())[:1]
     for case in cases:
         found = stability.measured(case, ways, modes=False)

@@ -17,6 +17,7 @@ from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by
 from jvr.cli.runtime import nested, plain, progress, provenance, start_jax
 from jvr.cli.signals import INTERRUPTED, Terminated, said
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
+from jvr.io.config.parts import choices_of
 
 
 def demo_config() -> Path:
@@ -114,7 +115,7 @@ def _with_transfer_of_its_own(job: FitJob, result: Any, beforehand: Beforehand) 
 
 def _pictures(scene: Any, exposure: float, cameras: Any, job: FitJob) -> list[np.ndarray]:
     """What a scene looks like from each camera, in the radiance of the target images."""
-    from jvr.rendering.image import render
+    from jvr.rendering.render import render
 
     return [exposure * np.asarray(render(scene, camera, job.keywords["settings"]).rgb) for camera in cameras]
 
@@ -155,7 +156,7 @@ def _report(config: Config, job: FitJob, result: Any, pictures: Any) -> dict[str
     return {
         "command": "fit",
         "config": config.name,
-        "settings": tables.settings.model_dump(),
+        "settings": choices_of(job.keywords["settings"]),
         "fit": tables.fit.model_dump() if tables.fit else None,
         "outcome": result.outcome.value,
         "exposure": result.exposure,

@@ -11,8 +11,7 @@ from jvr.cli.beforehand import Beforehand
 from jvr.cli.inputs import BadInput, reading
 from jvr.cli.runtime import progress, provenance, start_jax
 from jvr.io.config import Config, build_cameras, build_scene
-from jvr.io.config.build import QUADRATURES
-from jvr.io.kinds import KINDS
+from jvr.io.kinds import kind_of
 from jvr.model.scene import Scene
 from jvr.rendering.foretelling import turns_of
 from jvr.rendering.measure import Measurement
@@ -45,7 +44,7 @@ def tune_settings(config: Config, output: Path, error: float | None, seconds: fl
             f"--time {seconds:g} is out of reach on this scene: the least that was reached is {found.measured.seconds:.2g} s"
         )
     tables = tables_of(found.turned)
-    if not config.tables.settings.skipping:
+    if config.tables.settings.skipping is False:
         # Measured with skipping, without which nothing can be negligible.
         tables["settings"]["skipping"] = True
     with replacing(output) as temporary:
@@ -100,18 +99,11 @@ def tables_of(choice: dict[str, Any]) -> dict[str, dict[str, Any]]:
     tables: dict[str, dict[str, Any]] = {"settings": {}}
     for name, value in choice.items():
         place, _, key = name.rpartition(".")
-        kind = _kind(value)
+        kind = kind_of(value)
         # A part that is a choice as a whole is known by its kind.
         key, value = ("kind" if place and kind else key), kind or value
         tables.setdefault(place.replace(" ", "_") or "settings", {})[key] = value
     return tables
-
-
-def _kind(value: Any) -> str | None:
-    """What a configuration calls an object, or `None` for what is none."""
-    named = [(cls.__name__, kind) for kind, cls in QUADRATURES.items()]
-    named += [(name, kind) for family, kinds in KINDS.items() if isinstance(value, family) for kind, name in kinds.items()]
-    return dict(named).get(type(value).__name__)
 
 
 def _toml(value: Any) -> str:

@@ -7,7 +7,7 @@ between nodes.
 import dataclasses
 import math
 import warnings
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -39,10 +39,14 @@ class TransferBleeding(AbstractBleeding):
     """Colour bleeding of the transfer function's colours, which rays pick up of what they pass: materials may be exchanged without a new
     projection."""
 
+    reads_material: ClassVar[bool] = False
+
 
 class MaterialBleeding(AbstractBleeding):
     """Colour bleeding of what the material reflects towards the origin of a ray, times the transfer function's colour where that tints
     it: a new material needs a new projection."""
+
+    reads_material: ClassVar[bool] = True
 
 
 class RadianceTransfer(AbstractRadianceTransfer):
@@ -177,7 +181,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
 
     @property
     def rays_need_gradient(self) -> bool:
-        return isinstance(self.bleeding, MaterialBleeding)
+        return self.bleeding is not None and self.bleeding.reads_material
 
     @property
     def is_frozen(self) -> bool:

@@ -4,7 +4,13 @@ Nothing else is ever imported or called for a file. A class of your own joins th
 """
 
 import importlib
+from collections.abc import Callable
+from typing import Any
 
+from jvr.integrators.slices.oracle import AbstractOracle
+from jvr.march.differentiation import AbstractAdjoint
+from jvr.march.quadrature import AbstractQuadrature
+from jvr.model.camera import AbstractCamera
 from jvr.model.effects import (
     AbstractBleeding,
     AbstractRadianceTransfer,
@@ -12,23 +18,24 @@ from jvr.model.effects import (
     AbstractShading,
     AbstractShadows,
 )
+from jvr.model.environment import EnvironmentLight
+from jvr.model.interpolation import AbstractInterpolation
 from jvr.model.light import AbstractEmitter
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
+from jvr.model.optical import AbstractOpticalModel
 from jvr.model.phase import AbstractPhase
 from jvr.model.transfer import AbstractTransfer
 from jvr.names import NAMES
+from jvr.rendering.integrator import AbstractIntegrator
 
+HOMES = {name: module for module, names in NAMES.items() for name in names}
 # Public classes that a scene is made of, by name: the module that is imported when a file names one, or a class that was registered.
 PARTS: dict[str, str | type] = {
-    name: module
-    for module, names in NAMES.items()
-    if module.startswith(("jvr.model.", "jvr.effects."))
-    for name in names
-    if name[0].isupper()
+    name: module for name, module in HOMES.items() if module.startswith(("jvr.model.", "jvr.effects.")) and name[0].isupper()
 }
-# What configurations call the classes of a family whose tables are the arguments of their constructors. Kinds whose tables say something
-# else, such as a file, are in `jvr.io.config.schema`.
+# What configurations call the classes of a family, or functions that make one, whose tables are the arguments of their constructors. Kinds
+# whose tables say something else, such as a file, are in `jvr.io.config.schema`.
 KINDS: dict[type, dict[str, str]] = {
     AbstractEmitter: {
         "directional": "DirectionalLight",
@@ -78,15 +85,42 @@ KINDS: dict[type, dict[str, str]] = {
         "microfacet": "MicrofacetBRDF",
         "phase": "PhaseBRDF",
     },
+    EnvironmentLight: {
+        "image": "EnvironmentLight.from_image",
+        "constant": "EnvironmentLight.constant",
+        "disc": "EnvironmentLight.disc",
+    },
+    AbstractOpticalModel: {
+        "emission-absorption": "EmissionAbsorption",
+        "emission-only": "EmissionOnly",
+        "absorption-only": "AbsorptionOnly",
+    },
+    AbstractInterpolation: {"trilinear": "Trilinear", "nearest": "Nearest"},
+    AbstractCamera: {
+        "perspective": "PerspectiveCamera",
+        "orthographic": "OrthographicCamera",
+        "fibonacci": "fibonacci_sphere",
+        "orbit": "orbit",
+    },
+    AbstractQuadrature: {"midpoint": "Midpoint", "pre-integrated": "PreIntegrated"},
+    AbstractAdjoint: {"replay": "Replay", "forward": "Forward", "rows": "Rows"},
+    AbstractIntegrator: {"uniform": "Uniform", "slices": "Slices", "refinement": "Refinement"},
+    AbstractOracle: {
+        "local-error": "LocalError",
+        "opacity-change": "OpacityChange",
+        "brick-range": "BrickRange",
+        "finest": "Finest",
+    },
 }
 
 
 def register(kind: str, cls: type) -> None:
     """Makes a class of your own known to files, in one line: `jvr.register("ring", cls)`.
 
-    The class is a light, phase function, transfer function, shading, shadow algorithm, scattering, gradient estimator or BRDF, whose
-    constructor's arguments are parameters declared beside its fields (`jvr.model.parameters`). It can then be named in a configuration,
-    `kind = "ring"`, with a key for each of them, and `jvr.save_scene` and `jvr.load_scene` write and read it by the name of its class.
+    The class is a light, phase function, transfer function, shading, shadow algorithm, scattering, gradient estimator, BRDF, camera,
+    integrator or another whose kinds configurations name, whose constructor's arguments are parameters declared beside its fields
+    (`jvr.model.parameters`). It can then be named in a configuration, `kind = "ring"`, with a key for each of them, and
+    `jvr.save_scene` and `jvr.load_scene` write and read it by the name of its class.
     Registering a class of the same name and kind again, as a notebook does, replaces it.
 
     **Raises** `TypeError` for a class of no such family, `ValueError` for a kind or name that another class has.
@@ -104,3 +138,20 @@ def class_named(name: str) -> type:
     """A class of `PARTS`."""
     found = PARTS[name]
     return found if isinstance(found, type) else getattr(importlib.import_module(found), name)
+
+
+def maker_of(family: type, kind: str) -> Callable[..., Any]:
+    """What makes a part of a kind: its class, or a function, such as `jvr.EnvironmentLight.disc`."""
+    name, *method = KINDS[family][kind].split(".")
+    found = PARTS.get(name, HOMES.get(name))
+    found = found if isinstance(found, type) else getattr(importlib.import_module(str(found)), name)
+    return getattr(found, *method) if method else found
+
+
+def kind_of(part: Any) -> str | None:
+    """What configurations call the class of an object, or `None` where they have no name for it."""
+    for family, kinds in KINDS.items():
+        for kind, name in kinds.items() if isinstance(part, family) else ():
+            if name == type(part).__name__ and maker_of(family, kind) is type(part):
+                return kind
+    return None

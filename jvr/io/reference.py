@@ -1,6 +1,7 @@
 """The parameters of public classes, as data and as Markdown, from what the classes declare."""
 
 import dataclasses
+import functools
 import importlib
 import inspect
 from typing import Any
@@ -26,20 +27,29 @@ class Entry:
     hint: str
 
 
-def parameters_of(cls: type) -> tuple[Entry, ...]:
-    """The declared parameters of a class that its constructor takes, in its order."""
-    arguments, fields = inspect.signature(cls.__init__).parameters, declared(cls)
+def parameters_of(thing: Any) -> tuple[Entry, ...]:
+    """The declared parameters of a class that its constructor takes, or those of a function, in its order."""
+    arguments, fields = inspect.signature(thing.__init__ if isinstance(thing, type) else thing).parameters, declared(thing)
     taken = [(fields[name], argument.default) for name, argument in arguments.items() if name in fields]
     # What only jvr itself passes on, such as digits of a position, has no public class.
-    hidden = lambda field: any(part.__name__ in ("Remainder", "ProjectedRadianceTransfer") for part in parts_of(field.type))
+    hidden = lambda field: any(not _is_public(part) for part in parts_of(field.type))
     return tuple(_entry(field, default) for field, default in taken if not hidden(field))
 
 
 def public_parameters() -> dict[str, tuple[Entry, ...]]:
     """The parameters of every public class that has some, by the name of the class."""
+    return {name: parameters_of(cls) for name, cls in _public_classes().items() if parameters_of(cls)}
+
+
+def _is_public(part: type) -> bool:
+    """Whether some public class is a part of this kind."""
+    return any(issubclass(cls, part) for cls in _public_classes().values())
+
+
+@functools.cache
+def _public_classes() -> dict[str, type]:
     things = {name: getattr(importlib.import_module(module), name) for module, names in NAMES.items() for name in names}
-    classes = {name: cls for name, cls in things.items() if inspect.isclass(cls) and issubclass(cls, eqx.Module)}
-    return {name: parameters_of(cls) for name, cls in sorted(classes.items()) if parameters_of(cls)}
+    return {name: cls for name, cls in sorted(things.items()) if inspect.isclass(cls) and issubclass(cls, eqx.Module)}
 
 
 def markdown(entries: tuple[Entry, ...]) -> str:

@@ -3,9 +3,9 @@
 import abc
 from typing import Any, ClassVar
 
-import equinox as eqx
-
+from jvr.model.parameters import assign, choice
 from jvr.model.parts import AbstractPart, PlanEntry
+from jvr.model.ranges import AT_LEAST_ONE
 from jvr.model.transfer import AbstractTransfer, LinearTransfer, LutTransfer
 
 
@@ -50,11 +50,10 @@ class PreIntegrated(AbstractQuadrature):
 
     pre_integrates: ClassVar[bool] = True
 
-    parts: int = eqx.field(static=True, default=1)
+    parts: int = choice(AT_LEAST_ONE, doc="parts of a segment that attenuate each other")
 
-    def __check_init__(self):
-        if isinstance(self.parts, bool) or not isinstance(self.parts, int) or self.parts < 1:
-            raise ValueError(f"PreIntegrated parts must be a positive whole number, not {self.parts!r}")
+    def __init__(self, parts: int = 1):
+        assign(self, parts=parts)
 
     @property
     def explanation(self) -> str:

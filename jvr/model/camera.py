@@ -11,15 +11,28 @@ from jaxtyping import Array, Float, Int
 
 from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder, in_double
-from jvr.model.parameters import assign, choice, parameter
-from jvr.model.ranges import ANGLE_OF_VIEW, AT_LEAST_ONE, POSITIVE
+from jvr.model.parameters import TRIPLE, arguments, assign, choice, parameter
+from jvr.model.ranges import ANGLE_OF_VIEW, AT_LEAST_ONE, DIRECTION, POSITIVE
 from jvr.numerics import normalise
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector
 
 
 def pixels() -> Any:
     """The declaration of the size of a picture."""
-    return choice(AT_LEAST_ONE, doc="pixels")
+    return choice(AT_LEAST_ONE, doc="pixels", most=65_536)
+
+
+def angle_of_view() -> Any:
+    """The declaration of a vertical angle of view."""
+    return parameter(ANGLE_OF_VIEW, doc="full vertical angle", unit="degrees")
+
+
+def around() -> dict[str, Any]:
+    """The declarations of the arguments of cameras that look inwards from all around."""
+    center = parameter(doc="x, y, z", unit="mm", shapes=TRIPLE)
+    radius = parameter(POSITIVE, doc="distance from the centre", unit="mm")
+    count = choice(AT_LEAST_ONE, doc="cameras", most=10_000)
+    return {"center": center, "radius": radius, "count": count, "fov_y": angle_of_view(), "width": pixels(), "height": pixels()}
 
 
 class AbstractCamera(eqx.Module):
@@ -69,7 +82,7 @@ class PerspectiveCamera(AbstractCamera):
     """
 
     world_from_camera: Affine = parameter(doc="rigid transform")
-    fov_y: Scalar = parameter(ANGLE_OF_VIEW, doc="full vertical angle", unit="degrees")
+    fov_y: Scalar = angle_of_view()
     width: int = pixels()
     height: int = pixels()
     remainder: Remainder = parameter(doc="what single precision leaves of the pose")
@@ -96,11 +109,48 @@ class PerspectiveCamera(AbstractCamera):
         return cls(pose, fov_y, width, height, remainder=remainder)
 
     def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
-        x, y = _plane(self, pixels, 2 * jnp.tan(jnp.deg2rad(self.fov_y) / 2))
-        norm = jnp.sqrt(x * x + y * y + 1)
-        direction = _rotate(self.world_from_camera, (x / norm, y / norm, -1 / norm))
-        aside = _rotate(self.world_from_camera, (ahead * x, ahead * y, jnp.zeros_like(x)))
-        return tuple(a + c for a, c in zip(aside, self.axis_at(ahead), strict=True)), direction, ahead * norm
+        return _through(self, *_plane(self, pixels, 2 * jnp.tan(jnp.deg2rad(self.fov_y) / 2)), ahead)
+
+
+class PinholeCamera(AbstractCamera):
+    """A pinhole camera as a calibration describes it: each axis has a focal length of its own, and the axis of view meets the picture
+    where it will.
+
+    The point (X, Y, Z) of its own frame, with Z < 0, is seen at column `c_x - f_x X / Z` and row `c_y + f_y Y / Z`, both counted in
+    pixels from the upper left corner of the picture, so that the centre of the first pixel is at (0.5, 0.5).
+
+    **Arguments:** `world_from_camera`: 4x4 rigid transform; `focal_lengths`: `(f_x, f_y)` in pixels; `principal_point`: `(c_x, c_y)` in
+    pixels, by default the middle of the picture; it may lie outside; `width`, `height`: pixels (static); `remainder`: of a pose that JAX
+    holds already. All arrays are differentiable. **Raises** `ValueError` for sizes below 1 and focal lengths that are not positive.
+    """
+
+    world_from_camera: Affine = parameter(doc="rigid transform")
+    focal_lengths: Float[Array, "2"] = parameter(POSITIVE, doc="along columns and rows", unit="pixels")
+    principal_point: Float[Array, "2"] = parameter(doc="column and row, from the upper left corner", unit="pixels")
+    width: int = pixels()
+    height: int = pixels()
+    remainder: Remainder = parameter(doc="what single precision leaves of the pose")
+
+    def __init__(
+        self,
+        world_from_camera: ArrayLike,
+        focal_lengths: ArrayLike,
+        width: int,
+        height: int,
+        *,
+        principal_point: ArrayLike | None = None,
+        remainder: Remainder | None = None,
+    ):
+        self.world_from_camera = affine(world_from_camera, "world_from_camera")
+        self.remainder = Remainder.left(world_from_camera, self.world_from_camera, remainder)
+        middle = (width / 2, height / 2) if principal_point is None else principal_point
+        assign(self, focal_lengths=focal_lengths, principal_point=middle, width=width, height=height)
+
+    def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
+        row, column = jnp.divmod(pixels, self.width)
+        x = (column + 0.5 - self.principal_point[0]) / self.focal_lengths[0]
+        y = (self.principal_point[1] - row - 0.5) / self.focal_lengths[1]
+        return _through(self, x, y, ahead)
 
 
 class OrthographicCamera(AbstractCamera):
@@ -182,6 +232,7 @@ def _axes(eye: Exact, target: Exact, up: Vector) -> tuple[Vector, Vector, Affine
     return back, side, pose, low
 
 
+@arguments(**around(), axis=parameter(DIRECTION, doc="x, y, z; what is up in every picture", shapes=TRIPLE))
 def orbit(
     center: ArrayLike, radius: ArrayLike, count: int, fov_y: ArrayLike, width: int, height: int, *, axis: ArrayLike = (0, 0, 1)
 ) -> tuple[PerspectiveCamera, ...]:
@@ -195,6 +246,7 @@ def orbit(
     return _around(center, radius, offsets, axis, fov_y, width, height)
 
 
+@arguments(**around())
 def fibonacci_sphere(
     center: ArrayLike, radius: ArrayLike, count: int, fov_y: ArrayLike, width: int, height: int
 ) -> tuple[PerspectiveCamera, ...]:
@@ -208,15 +260,22 @@ def fibonacci_sphere(
 
 
 def _around(center: ArrayLike, radius: ArrayLike, offsets: list[Any], up: Array, fov_y: ArrayLike, width: int, height: int):
-    if not offsets:
-        raise ValueError("count must be at least 1")
-    float_array(center, "center", (3,))
     center, radius, cameras = in_double(center), in_double(radius), []
     for offset in offsets:
         # At the poles of the sphere z cannot point up in the picture; y then does.
         upward = jnp.where(jnp.abs(jnp.dot(jnp.asarray(offset), up)) > 0.999, jnp.roll(up, -1), up)
         cameras.append(PerspectiveCamera.look_at(center + radius * in_double(offset), center, upward, fov_y, width, height))
     return tuple(cameras)
+
+
+def _through(
+    camera: AbstractCamera, x: Float[Array, "rays"], y: Float[Array, "rays"], ahead: Scalar
+) -> tuple[Triple, Triple, Float[Array, "rays"]]:
+    """`rays_ahead` of rays from the eye through (x, y) of the plane at distance 1."""
+    norm = jnp.sqrt(x * x + y * y + 1)
+    direction = _rotate(camera.world_from_camera, (x / norm, y / norm, -1 / norm))
+    aside = _rotate(camera.world_from_camera, (ahead * x, ahead * y, jnp.zeros_like(x)))
+    return tuple(a + c for a, c in zip(aside, camera.axis_at(ahead), strict=True)), direction, ahead * norm
 
 
 def _plane(

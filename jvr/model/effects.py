@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 
@@ -112,6 +112,9 @@ class AbstractMaterial(AbstractPart):
 
 class AbstractBleeding(eqx.Module):
     """Colour bleeding: what rays of a radiance transfer pick up on their way."""
+
+    # Whether that is what the material of the scene reflects, so that another one needs a new projection.
+    reads_material: ClassVar[bool]
 
 
 class AbstractRadianceTransfer(AbstractPart):

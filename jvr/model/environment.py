@@ -6,18 +6,27 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model import harmonics
 from jvr.model.checks import float_array, known, radiances, require
 from jvr.model.harmonics.projection import cap
-from jvr.model.parameters import assign, choice, parameter
+from jvr.model.parameters import GREY_OR_RGB, TRIPLE, arguments, assign, choice, parameter
 from jvr.model.parts import AbstractPart, PlanEntry, is_zero, spelling
-from jvr.model.ranges import NOT_NEGATIVE
+from jvr.model.ranges import DIRECTION, NOT_NEGATIVE, POSITIVE, RADIANCE, Interval
 from jvr.numerics import normalise
 from jvr.pictures import as_radiance
 from jvr.types import ArrayLike
+
+
+def order_of_harmonics() -> Any:
+    """The declaration of the order of an environment."""
+    return choice(Interval(low=0.0), doc="order of the harmonics", hint="3 is a good start", most=10)
+
+
+def radiance_of_light() -> Any:
+    """The declaration of the radiance of an environment."""
+    return parameter(RADIANCE, doc="radiance", shapes=GREY_OR_RGB)
 
 
 class EnvironmentLight(AbstractPart):
@@ -51,6 +60,11 @@ class EnvironmentLight(AbstractPart):
         return scene.replaced(environment=None)
 
     @classmethod
+    @arguments(
+        order=order_of_harmonics(),
+        window=parameter(POSITIVE, doc="band from which nothing is left"),
+        clamped=choice(doc="whether negative radiance is cut off"),
+    )
     def from_image(
         cls, image: str | os.PathLike | ArrayLike, order: int = 3, *, window: float | int | None = None, clamped: bool = True
     ) -> "EnvironmentLight":
@@ -81,6 +95,7 @@ class EnvironmentLight(AbstractPart):
         return cls(_windowed(harmonics.project(fn, order), window))
 
     @classmethod
+    @arguments(radiance=radiance_of_light(), order=order_of_harmonics())
     def constant(cls, radiance: ArrayLike = 1.0, order: int = 0) -> "EnvironmentLight":
         """The same radiance, a number or `(3,)`, from everywhere."""
         rgb = jnp.broadcast_to(radiances(radiance, "radiance"), (3,))
@@ -88,13 +103,17 @@ class EnvironmentLight(AbstractPart):
         return cls(coefficients.at[0].set(math.sqrt(4 * math.pi) * rgb))
 
     @classmethod
+    @arguments(
+        towards=parameter(DIRECTION, doc="x, y, z, from the scene to the light", shapes=TRIPLE),
+        half_angle=parameter(Interval(0.0, 180.0, "(]"), doc="from the middle to the rim", unit="degrees"),
+        radiance=radiance_of_light(),
+        order=order_of_harmonics(),
+    )
     def disc(cls, towards: ArrayLike, half_angle: ArrayLike, radiance: ArrayLike = 1.0, order: int = 3) -> "EnvironmentLight":
         """A round area light, far away: `radiance` (a number or `(3,)`) from all directions within `half_angle` degrees of `towards`,
         `(3,)`; projected in closed form and differentiable in all three. **Raises** `ValueError` for angles outside of 0 to 180."""
         angle = float_array(half_angle, "half_angle", ())
-        require(angle, lambda a: (a > 0) & (a <= 180), "half_angle must be above 0 and at most 180 degrees")
         axis = float_array(towards, "towards", (3,))
-        require(jnp.linalg.norm(axis), lambda n: np.isfinite(n) & (n > 0), "towards must be a direction, not zero")
         rgb = jnp.broadcast_to(radiances(radiance, "radiance"), (3,))
         kernel = jnp.stack(cap(2 * jnp.square(jnp.sin(jnp.deg2rad(angle) / 2)), order))
         lobe = harmonics.evaluate(order, normalise(axis)[None])[0]

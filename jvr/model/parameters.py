@@ -13,9 +13,13 @@ configuration (`jvr.io.config.schema.parts`), how it is saved and loaded, and th
 """
 
 import dataclasses
+import functools
+import inspect
+import math
 import types
 import typing
-from typing import Any, TypeAlias
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -28,6 +32,10 @@ Shape: TypeAlias = tuple[int | str, ...]
 
 # One number, or one for each of red, green and blue.
 GREY_OR_RGB: tuple[Shape, ...] = ((), (3,))
+# Three numbers.
+TRIPLE: tuple[Shape, ...] = ((3,),)
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 TAKE = {"": float_array, "colour": colours, "radiance": radiances}
 
 
@@ -48,6 +56,7 @@ class Parameter:
     - `by_channel`: whether, where the last axis is colour, each of its channels acts on that channel of a picture alone, as those of light
       do. A fit then takes one forward derivative for all three.
     - `least`: entries that a named axis has at least.
+    - `most`: the largest number that a file may ask for, where a constructor takes larger ones: a slip of the pen must not take all memory.
     """
 
     within: Range
@@ -58,6 +67,7 @@ class Parameter:
     by_scalar: bool = False
     by_channel: bool = False
     least: int = 1
+    most: float | int = math.inf
 
     @property
     def about(self) -> str:
@@ -79,15 +89,44 @@ def parameter(
     return eqx.field(metadata={"parameter": Parameter(within, doc, unit, hint, shapes, by_scalar, by_channel, least)})
 
 
-def choice(within: Range = ANY, *, doc: str, unit: str = "", hint: str = "", **default: Any) -> Any:
+def choice(within: Range = ANY, *, doc: str, unit: str = "", hint: str = "", most: float | int = math.inf, **default: Any) -> Any:
     """A static field: a number, truth value or word that a program is compiled for; see `Parameter`. `default`: of classes without a
     constructor of their own."""
-    return eqx.field(static=True, metadata={"parameter": Parameter(within, doc, unit, hint)}, **default)
+    return eqx.field(static=True, metadata={"parameter": Parameter(within, doc, unit, hint, most=most)}, **default)
 
 
-def declared(cls: type) -> dict[str, dataclasses.Field]:
-    """The fields of a class that are declared parameters, by name."""
-    return {f.name: f for f in dataclasses.fields(cls) if "parameter" in f.metadata}
+def arguments(**fields: Any) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Declares arguments of a function as the fields of a class are, by `parameter` and `choice`; of arrays other than numbers with their
+    shapes. Each call checks them, as `assign` does, and passes them on as they came: an array of single precision has no room for all
+    digits of a position.
+
+        @arguments(radius=parameter(POSITIVE, doc="of the circle", unit="mm"), count=choice(AT_LEAST_ONE, doc="cameras"))
+        def ring(radius: ArrayLike, count: int) -> tuple[AbstractCamera, ...]: ...
+    """
+
+    def declare(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+        signature = inspect.signature(function)
+        for name, field in fields.items():
+            field.name, field.type = name, signature.parameters[name].annotation
+
+        @functools.wraps(function)
+        def checked(*args: Arguments.args, **keywords: Arguments.kwargs) -> Result:
+            given, lengths = signature.bind(*args, **keywords), {}
+            for name, value in given.arguments.items():
+                if name in fields:
+                    _checked(fields[name], value, lengths)
+            return function(*args, **keywords)
+
+        vars(checked)["declared"] = fields
+        return checked
+
+    return declare
+
+
+def declared(thing: Any) -> dict[str, dataclasses.Field]:
+    """The fields of a class, or the arguments of a function, that are declared parameters, by name."""
+    fields = dataclasses.fields(thing) if isinstance(thing, type) else getattr(thing, "declared", {}).values()
+    return {f.name: f for f in fields if "parameter" in f.metadata}
 
 
 def range_at(tree: Any, path: tuple[Any, ...]) -> Range:

@@ -12,7 +12,7 @@ import numpy as np
 from jvr.model.camera import AbstractCamera
 from jvr.model.parts import AbstractPart, parts_of, spelling, with_part
 from jvr.model.scene import Scene
-from jvr.rendering.image import render
+from jvr.rendering.render import render
 from jvr.rendering.settings import Settings
 
 Variant = tuple[Scene, Settings]
@@ -20,11 +20,13 @@ Change = Callable[[Scene, Settings], Variant]
 
 
 class Candidate(NamedTuple):
-    """A change of a variant: where, what it is called, and what makes it; that raises `ValueError` where it cannot be made."""
+    """A change of a variant: where, what it is called, and what makes it; that raises `ValueError` where it cannot be made. `drops`:
+    whether an effect goes, which makes a scene simpler though it may save no time."""
 
     place: str
     title: str
     change: Change
+    drops: bool = False
 
 
 # A change that saves less of the time than this is noise.
@@ -98,7 +100,7 @@ def advise(
     contributions = tuple(Contribution(effect.title, rmse, 1 - without / seconds) for effect, rmse, without in dropped)
     proposal = None
     if tolerance is not None:
-        candidates = [(one._replace(title=f"drop {one.title}"), rmse, without) for one, rmse, without in dropped]
+        candidates = [(one._replace(title=f"drop {one.title}", drops=True), rmse, without) for one, rmse, without in dropped]
         candidates += [measured(notch) for notch in _coarser(scene, settings)]
         proposal = _proposal(candidates, (scene, settings), camera, picture, seconds, tolerance, repeats)
     remarks = tuple(remarks_on(scene, render(scene, camera, settings).stats))
@@ -144,7 +146,7 @@ def _proposal(
 ) -> Proposal:
     """Makes the changes that save most first, each only if all so far together stay within the tolerance."""
     made, rmse, places = [], 0.0, set()
-    saves = lambda one, without: without < (1 - LEAST_SAVING) * seconds or one.title.startswith("drop")
+    saves = lambda one, without: without < (1 - LEAST_SAVING) * seconds or one.drops
     worth = [(one, without) for one, difference, without in candidates if difference <= tolerance and saves(one, without)]
     for one, _ in sorted(worth, key=lambda c: c[1]):
         # One change in each place; what has been dropped together with another part cannot be changed.

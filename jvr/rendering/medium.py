@@ -4,7 +4,8 @@ Modules of effects are imported here and only for scenes that hold them; everyth
 `jvr.model.effects`.
 """
 
-from typing import Any, NamedTuple, cast
+import dataclasses
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -21,26 +22,53 @@ from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbsorptionOnly
 from jvr.model.preintegration import PreIntegratedTable
 from jvr.model.scene import Scene
-from jvr.rendering.settings import Settings
 from jvr.types import Scalar
+
+if TYPE_CHECKING:
+    # Settings hold an integrator, which reads what is prepared.
+    from jvr.rendering.settings import Settings
 
 
 class Prepared(NamedTuple):
-    """What is computed once for all rays of a picture: visible bricks, what is in the way of light, and the material under
-    environment lighting, each `None` where the scene asks for none; and the length of a segment, that of the settings for `None`."""
+    """What all rays through a scene share, computed once.
 
+    - `scene`: near its volume (`jvr.rendering.trace.near_volume`);
+    - `settings`: how it is rendered, all but the step, which is 1 here;
+    - `dt`: the world length of a segment;
+    - `occupancy`, `shadows`, `environment`: visible bricks, what is in the way of light, and the material under environment lighting,
+      each `None` where the scene asks for none.
+    """
+
+    scene: Scene
+    settings: "Settings"
+    dt: Scalar
     occupancy: Occupancy | None = None
     shadows: AbstractVisibility | None = None
     environment: Any = None
-    dt: Scalar | None = None
 
     @property
     def shadow_stats(self) -> Any:
         return None if self.shadows is None else self.shadows.stats
 
 
-def medium(scene: Scene, settings: Settings, prepared: Prepared = Prepared()) -> Medium:
+def prepare(
+    scene: Scene,
+    settings: "Settings",
+    dt: Scalar,
+    *,
+    skips: bool = True,
+    visible: AbstractVisibility | None = None,
+) -> Prepared:
+    """What rays through a scene near its volume need to know beforehand. `skips`: whether they skip empty bricks; `visible`: how much light
+    reaches a point, where that is known."""
+    occupied = occupancy(scene, settings) if skips else None
+    shadows = visibility(scene, occupied) if visible is None else visible
+    return Prepared(scene, dataclasses.replace(settings, step=1.0), dt, occupied, shadows, environment(scene))
+
+
+def medium(prepared: Prepared) -> Medium:
     """What of a scene rays march through: what the scene does not name is not in it."""
+    scene, settings = prepared.scene, prepared.settings
     frame, normals = _gradients(scene)
     field = VoxelField(scene.volume, normals)
     quadrature = settings.quadrature
@@ -111,7 +139,7 @@ def environment(scene: Scene) -> Any:
     return environment_lighting_of(scene)
 
 
-def occupancy(scene: Scene, settings: Settings) -> Occupancy | None:
+def occupancy(scene: Scene, settings: "Settings") -> Occupancy | None:
     """Which bricks of a scene are visible, or `None` where nothing is to be skipped."""
     if not settings.skipping:
         return None

@@ -199,11 +199,19 @@ def test_a_picture_that_finds_no_room_is_one_line(name):
 # --- Signals ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def heard():
+    """A shell lets what runs in its background ignore SIGINT, which processes hand on to those that they start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize(
     ("name", "seconds"),
     [("SIGTERM", 1.0), *(pytest.param(n, s, marks=pytest.mark.slow) for n in ("SIGINT", "SIGTERM") for s in (0.5, 2, 4, 7))],
 )
-def test_a_signal_ends_a_command_in_one_line_whenever_it_comes(name, seconds):
+def test_a_signal_ends_a_command_in_one_line_whenever_it_comes(name, seconds, heard):
     """In imports, while something is compiled, while pictures are made."""
     process = subprocess.Popen([*JVR, "fit", "fit.toml", "-o", "out"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     time.sleep(seconds)
@@ -216,7 +224,7 @@ def test_a_signal_ends_a_command_in_one_line_whenever_it_comes(name, seconds):
     assert not list(Path().rglob("*.part"))
 
 
-def test_a_signal_that_is_swallowed_counts_all_the_same():
+def test_a_signal_that_is_swallowed_counts_all_the_same(heard):
     code = (
         "from jvr.cli import signals; import time; signals.GRACE = 0.1; signals.catch()\n"
         "while True:\n try: print('ready', flush=True); time.sleep(60)\n except KeyboardInterrupt: time.sleep(60)"

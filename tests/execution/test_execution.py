@@ -142,7 +142,7 @@ def test_rays_over_three_devices(which):
     flags = ["-q", "-x", "-m", which, "-p", "no:cacheprovider", "-p", "no:xdist"]
     environment = os.environ | {"JVR_TEST_DEVICES": "3"}
     ran = subprocess.run(
-        [sys.executable, "-m", "pytest", str(cases), *flags], capture_output=True, text=True, env=environment, timeout=600
+        [sys.executable, "-m", "pytest", str(cases), *flags], capture_output=True, text=True, env=environment, timeout=3600
     )
     assert ran.returncode == 0, ran.stdout[-4000:]
 

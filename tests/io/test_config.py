@@ -20,7 +20,15 @@ from jvr.io.config import (
     read_transfer,
     write_transfer,
 )
+from jvr.io.config.parts import choices_of
+from jvr.io.kinds import KINDS, PARTS
+from jvr.march.quadrature import AbstractQuadrature
+from jvr.model.camera import AbstractCamera
+from jvr.model.exact import Remainder
+from jvr.model.parameters import assign, choice, parameter
+from jvr.model.ranges import ANGLE_OF_VIEW, AT_LEAST_ONE, UNIT_INTERVAL
 from jvr.rendering.trace import enter
+from jvr.types import Affine, Scalar
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 BASE = '[volume]\nbuiltin = "demo"\n[transfer]\nkind = "window"\n'
@@ -65,6 +73,23 @@ def refusal(text, *sets):
         ("[[camera]]\n[[camera]]\neyes = [0, 1, 2]", "camera[1].eyes", "did you mean 'eye'?"),
         ("[[camera]]\n[[camera]]\nkind = 'orbit'", "camera[1].count", "missing"),
         ("[camera]\nkind = 'fish'", "camera.kind", "perspective"),
+        ("[camera]\nkind = 'orthographic'\nfov_y = 30", "camera.fov_y", 'only kind = "perspective" or'),
+        ("[camera]\nkind = 'orbit'\ncount = 3\naxis = [0, 0, 0]", "camera.axis", "must have a direction"),
+        ("[[camera]]\nkind = 'orbit'\ncount = 99999", "camera[0].count", "from 1 to 10000"),
+        ("[camera]\nworld_from_camera = []", "camera.world_from_camera", "unknown key"),
+        ("[settings]\nkind = 'fast'", "settings.kind", "unknown key"),
+        ("[settings]\nnegligible = 0.1\nskipping = false", "settings", "skipping=True"),
+        ("[settings]\nquadrature = 3", "settings.quadrature", "or one of 'midpoint', 'pre-integrated', not 3"),
+        (
+            "[settings.quadrature]\nkind = 'midpoint'\nparts = 2",
+            "settings.quadrature.parts",
+            'only kind = "pre-integrated" has it',
+        ),
+        ("[settings.sampling]\nkind = 'slices'\nlevels = 6", "settings.sampling.levels", "from 0 to 5"),
+        ("[settings.sampling]\nkind = 'slices'\ntolerance = 0", "settings.sampling.tolerance", "must be positive"),
+        ("[settings.sampling]\nkind = 'slices'\noracle = 'finst'", "settings.sampling.oracle", "did you mean 'finest'?"),
+        ("[settings.sampling]\nkind = 'refinement'\ntile = 6", "settings.sampling", "a power of two from 2 to 64"),
+        ("[clipping]\nkind = 'box'\nlower = [0, 0, 0]\nupper = [1, 1, 1]", "clipping.kind", "unknown key"),
         ("[camera]\nwidth = 12.5", "camera.width", "whole number"),
         ("[clipping]\nlower = [0, 0, 0]\nupper = [1, 1, 0]", "clipping", "lower < upper"),
         ("[fit]\nloss = 'huber'", "fit.images", "[truth]"),
@@ -113,7 +138,7 @@ def test_overrides_take_toml_values_and_plain_text():
     made = config(BASE, "settings.step=0.25", "camera.eye=[9, 0, 0]", "optical=emission-only", "volume.source=a = b")
     assert made.tables.settings.step == 0.25
     assert made.tables.camera[0].eye == [9, 0, 0]
-    assert made.tables.optical == "emission-only"
+    assert made.tables.optical.part is jvr.EmissionOnly
     assert made.tables.volume.source == "a = b"
 
 
@@ -225,11 +250,75 @@ def test_settings_become_objects():
         ("{kind='refinement', tolerance=0.02, tile=16}", jvr.Refinement(0.02, tile=16)),
         ("'slices'", jvr.Slices()),
         ("{kind='slices', oracle='brick-range', tolerance=0.02, levels=2}", jvr.Slices(jvr.BrickRange(0.02), levels=2)),
+        ("{kind='slices', tolerance=0.02}", jvr.Slices(jvr.LocalError(0.02))),
+        ("{kind='slices', oracle={kind='brick-range', tolerance=0.02}}", jvr.Slices(jvr.BrickRange(0.02))),
         ("{kind='slices', oracle='finest'}", jvr.Slices(jvr.Finest())),
+        ("{kind='slices', oracle='finest', tolerance=0.02}", jvr.Slices(jvr.Finest())),
     ],
 )
 def test_a_sampling_is_a_name_or_a_table(text, wanted):
-    assert build_settings(config(BASE, f"settings.sampling={text}")) == jvr.Settings(sampling=wanted)
+    settings = build_settings(config(BASE, f"settings.sampling={text}"))
+    assert settings == jvr.Settings(sampling=wanted)
+    # What a report says of settings are settings again.
+    assert build_settings(config_from({"settings": choices_of(settings)} | tomllib.loads(BASE), "again")) == settings
+
+
+class Fisheye(AbstractCamera):
+    """A camera of somebody's own: the angle from its axis is in proportion to the distance from the middle of the picture."""
+
+    world_from_camera: Affine = parameter(doc="rigid transform")
+    angle: Scalar = parameter(ANGLE_OF_VIEW, doc="of the picture's height", unit="degrees")
+    width: int = choice(AT_LEAST_ONE, doc="pixels")
+    height: int = choice(AT_LEAST_ONE, doc="pixels")
+    remainder: Remainder = parameter(doc="of the pose")
+
+    def __init__(self, world_from_camera, angle=170.0, width=8, height=8):
+        self.world_from_camera, self.remainder = world_from_camera, Remainder.left(world_from_camera, world_from_camera, None)
+        assign(self, angle=angle, width=width, height=height)
+
+    def rays_ahead(self, pixels, ahead):
+        raise NotImplementedError
+
+
+class Thrifty(AbstractQuadrature):
+    """A quadrature of somebody's own."""
+
+    weight: float = choice(UNIT_INTERVAL, doc="of the middle")
+
+    def __init__(self, weight=0.5):
+        assign(self, weight=weight)
+
+    @property
+    def explanation(self):
+        return ""
+
+    def integrates(self, transfer):
+        return True
+
+
+@pytest.fixture
+def registered():
+    known = dict(PARTS), {family: dict(names) for family, names in KINDS.items()}
+    jvr.register("fisheye", Fisheye)
+    jvr.register("thrifty", Thrifty)
+    yield
+    for here, before in zip((PARTS, KINDS), known, strict=True):
+        here.clear()
+        here.update(before)
+
+
+def test_cameras_and_settings_take_classes_of_ones_own(registered):
+    made = config(BASE, "camera={kind='fisheye',eye=[9,8,700],angle=90}", "settings.quadrature={kind='thrifty',weight=0.25}")
+    _, (camera,), settings = build(made)
+    assert isinstance(camera, Fisheye)
+    assert float(camera.angle) == 90
+    np.testing.assert_allclose(camera.world_from_camera[:3, 3], [9, 8, 700])
+    assert settings == jvr.Settings(quadrature=Thrifty(0.25))
+    assert "camera.angle: must be between 0 and 180, without either (of the picture's height, in degrees), not 180" in refusal(
+        BASE, "camera={kind='fisheye',angle=180}"
+    )
+    assert "camera: eye is missing: from where a Fisheye shows the whole volume is not known" in refusal(BASE, "camera=fisheye")
+    assert "settings.quadrature.weight: must be in [0, 1]" in refusal(BASE, "settings.quadrature={kind='thrifty',weight=2}")
 
 
 def test_names_become_objects():

@@ -221,6 +221,13 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "OpacityShadowMap": {},
     "OrthographicCamera": {"world_from_camera": POSE, "height_world": 1.0, "width": 2, "height": 2},
     "PerspectiveCamera": {"world_from_camera": POSE, "fov_y": 30.0, "width": 2, "height": 2},
+    "PinholeCamera": {
+        "world_from_camera": POSE,
+        "focal_lengths": (2.0, 3.0),
+        "width": 2,
+        "height": 2,
+        "principal_point": (0.5, 1.5),
+    },
     "PhaseBRDF": {"phase": jvr.Isotropic()},
     "Phong": {},
     "PhongBRDF": {},

@@ -17,26 +17,15 @@ from jvr.io.config.light import graded, light_parts
 from jvr.io.config.load import Config, started
 from jvr.io.config.parts import made
 from jvr.io.config.schema.transfer import TransferFile, TransferTable
-from jvr.io.config.schema.whole import AnySampling, FitTable, RefinementTable, SlicesTable, VolumeTable
+from jvr.io.config.schema.whole import FitTable, VolumeTable
 from jvr.io.config.transfers import build_transfer, read_transfer, with_gradient
-from jvr.march.differentiation import Forward, Replay, Rows
-from jvr.march.oracle import BrickRange, Finest, LocalError, OpacityChange
-from jvr.march.quadrature import Midpoint, PreIntegrated
 from jvr.model.camera import AbstractCamera, PerspectiveCamera, fibonacci_sphere
-from jvr.model.interpolation import Nearest, Trilinear
-from jvr.model.optical import AbsorptionOnly, EmissionAbsorption, EmissionOnly
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTransfer, LutTransfer
 from jvr.model.volume import Volume
-from jvr.rendering.image import render
-from jvr.rendering.sampling import AbstractSampling, Refinement, Slices, Uniform
+from jvr.rendering.render import render
 from jvr.rendering.settings import Settings
 
-QUADRATURES = {"midpoint": Midpoint, "pre-integrated": PreIntegrated}
-ADJOINTS = {"replay": Replay, "forward": Forward, "rows": Rows}
-ORACLES = {"local-error": LocalError, "opacity-change": OpacityChange, "brick-range": BrickRange}
-INTERPOLATIONS = {"trilinear": Trilinear, "nearest": Nearest}
-OPTICAL = {"emission-absorption": EmissionAbsorption, "emission-only": EmissionOnly, "absorption-only": AbsorptionOnly}
 READ_KEYWORDS = ("shape", "dtype", "spacing", "origin", "direction", "slope", "intercept")
 READ_KEYWORDS += ("array", "series", "axes", "channel", "time", "missing", "nan_value")
 
@@ -62,18 +51,7 @@ class FitJob(NamedTuple):
 
 def build_settings(config: Config) -> Settings:
     """`jvr.Settings` of `[settings]`."""
-    table = config.tables.settings
-    with blame(config.name, "settings"):
-        return Settings(
-            table.step,
-            termination=table.termination,
-            quadrature=QUADRATURES[table.quadrature](),
-            skipping=table.skipping,
-            negligible=table.negligible,
-            adjoint=ADJOINTS[table.adjoint](),
-            sampling=_sampling(table.sampling),
-            tile=table.tile,
-        )
+    return made(config.where, "settings", config.tables.settings)
 
 
 def build_volume(config: Config) -> Volume:
@@ -99,7 +77,10 @@ def build_volume(config: Config) -> Volume:
 
 def interpolated(config: Config, volume: Volume) -> Volume:
     """A volume with the interpolation that a configuration says."""
-    return eqx.tree_at(lambda v: v.interpolation, volume, INTERPOLATIONS[config.tables.volume.interpolation]())
+    table = config.tables.volume.interpolation
+    if table is None:
+        return volume
+    return eqx.tree_at(lambda v: v.interpolation, volume, made(config.where, "volume.interpolation", table))
 
 
 def build_scene(config: Config, volume: Volume | None = None) -> Scene:
@@ -155,15 +136,6 @@ def build_fit(
     return FitJob(scene, tuple(inside), tuple(map(picture, inside)), truth, held_out, keywords, keeps_radiance_transfer(config))
 
 
-def _sampling(table: AnySampling) -> AbstractSampling:
-    if isinstance(table, RefinementTable):
-        return Refinement(table.tolerance, tile=table.tile)
-    if isinstance(table, SlicesTable):
-        oracle = Finest() if table.oracle == "finest" else ORACLES[table.oracle](table.tolerance)
-        return Slices(oracle, levels=table.levels)
-    return Uniform()
-
-
 def _builtin() -> Volume:
     from jvr.io.demo import demo_volume
 
@@ -185,7 +157,9 @@ def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
     fitted = () if tables.fit is None else tables.fit.unknowns
     if not any(name.startswith("volume.") for name in fitted):
         volume = graded(volume, light, transfer)
-    surroundings = {"background": tables.background, "clipping": clipping, "optical": OPTICAL[tables.optical]()}
+    surroundings = {"background": tables.background, "clipping": clipping}
+    if tables.optical is not None:
+        surroundings["optical"] = made(config.where, "optical", tables.optical)
     return Scene(volume, transfer, **surroundings, **light)
 
 

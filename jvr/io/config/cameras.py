@@ -1,16 +1,17 @@
 """Cameras from their tables."""
 
 import itertools
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jvr.io.config.schema.whole import AnyCamera, OrthographicTable, PerspectiveTable, RigTable
+from jvr.io.config.schema.whole import RigTable, SingleTable
 from jvr.march.occupancy import visible_bricks
 from jvr.model.bricks import bricks_of
-from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, fibonacci_sphere, orbit
+from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, look_at
 from jvr.model.exact import in_double
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
@@ -30,10 +31,19 @@ VIEWS = {
 SPECK, SPECKS = 8, 0.05
 # How much larger than what it shows a picture is.
 MARGIN = 1.05
+# Of a camera that does not say it: pixels, and degrees.
+SIZE, FOV_Y = {"width": 512, "height": 512}, 30.0
+# Keywords of a camera besides its place.
+Lens: TypeAlias = dict[str, Any]
 
 
-def cameras_of(table: AnyCamera, volume: Volume, transfer: AbstractTransfer | None = None) -> tuple[AbstractCamera, ...]:
-    """The cameras of one table; what it leaves out comes from the box of the volume, or from what `transfer` leaves visible of it."""
+def cameras_of(
+    table: SingleTable | RigTable, volume: Volume, transfer: AbstractTransfer | None = None
+) -> tuple[AbstractCamera, ...]:
+    """The cameras of one table; what it leaves out comes from the box of the volume, or from what `transfer` leaves visible of it.
+
+    **Raises** `ValueError` for a place that a camera cannot have.
+    """
     corners = _corners(volume)
     if table.frame == "visible" and transfer is not None:
         seen = _visible_corners(volume, transfer)
@@ -41,23 +51,40 @@ def cameras_of(table: AnyCamera, volume: Volume, transfer: AbstractTransfer | No
     center = (corners.min(axis=0) + corners.max(axis=0)) / 2 if table.target is None else np.asarray(table.target, float)
     if isinstance(table, RigTable):
         return _rig(table, center, float(np.max(np.linalg.norm(corners - center, axis=1))))
+    return (_single(table, center, corners),)
+
+
+def _single(table: SingleTable, center: np.ndarray, corners: np.ndarray) -> AbstractCamera:
     right, up, back = _pose(table, center)
     if table.target is None and table.eye is None:
         # What is seen need not lie evenly about the middle of its box.
         for axis in (right, up):
             ends = (corners - center) @ axis
             center = center + axis * (ends.min() + ends.max()) / 2
-    corners = corners - center
+    corners, lens = corners - center, SIZE | table.keywords()
     x, y, depth = np.abs(corners @ right), np.abs(corners @ up), corners @ back
-    aspect = table.width / table.height
-    if isinstance(table, PerspectiveTable):
-        half = np.tan(np.radians(table.fov_y / 2))
-        distance = np.max(np.maximum(x / (half * aspect), y / half) * MARGIN + depth)
-        eye = center + distance * back if table.eye is None else table.eye
-        return (PerspectiveCamera.look_at(eye, center, up, table.fov_y, table.width, table.height),)
-    extent = 2 * MARGIN * np.max(np.maximum(x / aspect, y)) if table.height_world is None else table.height_world
-    eye = center + (np.max(depth) + extent) * back if table.eye is None else table.eye
-    return (OrthographicCamera.look_at(eye, center, up, extent, table.width, table.height),)
+    kind: Any = table.part
+    if kind in FRAMINGS:
+        lens, distance = FRAMINGS[kind](lens, x, y, depth)
+        return kind.look_at(center + distance * back if table.eye is None else table.eye, center, up, **lens)
+    if table.eye is None:
+        raise ValueError(f"eye is missing: from where a {kind.__name__} shows the whole volume is not known")
+    return kind(world_from_camera=look_at(table.eye, center, up), **lens)
+
+
+def _perspective(lens: Lens, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> tuple[Lens, float]:
+    """The lens, and how far away a camera is that shows points: `x`, `y` from its axis, `depth` towards it."""
+    lens = {"fov_y": FOV_Y} | lens
+    half, aspect = np.tan(np.radians(lens["fov_y"] / 2)), lens["width"] / lens["height"]
+    return lens, np.max(np.maximum(x / (half * aspect), y / half) * MARGIN + depth)
+
+
+def _orthographic(lens: Lens, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> tuple[Lens, float]:
+    lens = {"height_world": 2 * MARGIN * np.max(np.maximum(x / (lens["width"] / lens["height"]), y))} | lens
+    return lens, np.max(depth) + lens["height_world"]
+
+
+FRAMINGS: dict[Any, Callable[..., tuple[Lens, float]]] = {PerspectiveCamera: _perspective, OrthographicCamera: _orthographic}
 
 
 def _corners(volume: Volume) -> np.ndarray:
@@ -103,7 +130,7 @@ def _without_data(volume: Volume, size: int) -> np.ndarray:
     return np.asarray(bricks_of(jnp.asarray(present.astype(np.uint8)), size).upper) == 0
 
 
-def _pose(table: PerspectiveTable | OrthographicTable, center: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pose(table: SingleTable, center: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Axes of the camera: right, up and back. z is up unless the view is along it."""
     back = np.asarray(VIEWS[table.view or "oblique"]) if table.eye is None else np.asarray(table.eye) - center
     if np.allclose(back, 0):
@@ -119,15 +146,10 @@ def _pose(table: PerspectiveTable | OrthographicTable, center: np.ndarray) -> tu
     return right, np.cross(back, right), back
 
 
-def _rig(table: RigTable, center: np.ndarray, extent: float) -> tuple[PerspectiveCamera, ...]:
-    if table.half_angle_tangent is not None:
-        fov_y = 2 * np.degrees(np.arctan(table.half_angle_tangent))
-    else:
-        fov_y = 30.0 if table.fov_y is None else table.fov_y
-    aspect = min(1.0, table.width / table.height)
-    half = np.arctan(np.tan(np.radians(fov_y / 2)) * aspect)
-    radius = extent / np.sin(half) if table.radius is None else table.radius
-    if table.kind == "fibonacci":
-        return fibonacci_sphere(center, radius, table.count, fov_y, table.width, table.height)
-    axis = (0.0, 0.0, 1.0) if table.axis is None else table.axis
-    return orbit(center, radius, table.count, fov_y, table.width, table.height, axis=axis)
+def _rig(table: RigTable, center: np.ndarray, extent: float) -> tuple[AbstractCamera, ...]:
+    tangent, keywords = table.half_angle_tangent, SIZE | {"fov_y": FOV_Y} | table.keywords()
+    if tangent is not None:
+        keywords["fov_y"] = 2 * np.degrees(np.arctan(tangent))
+    aspect = min(1.0, keywords["width"] / keywords["height"])
+    half = np.arctan(np.tan(np.radians(keywords["fov_y"] / 2)) * aspect)
+    return table.part(center, **{"radius": extent / np.sin(half)} | keywords)

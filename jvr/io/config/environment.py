@@ -10,7 +10,7 @@ from jvr.io.config.errors import blame
 from jvr.io.config.load import Config
 from jvr.io.config.parts import made
 from jvr.io.config.schema.environment import (
-    AnyEnvironment,
+    EnvironmentTable,
     ImageTable,
     MaterialsTable,
     MaterialTable,
@@ -59,12 +59,8 @@ def keeps_radiance_transfer(config: Config) -> bool:
 
 def _shapes_radiance_transfer(table: RadianceTransferTable) -> tuple[str, ...]:
     """Parts of the scene that radiance transfer is computed from."""
-    return (
-        "transfer",
-        "volume",
-        "clipping",
-        *(["material"] if table.bleeding is not None and table.bleeding.kind == "material" else []),
-    )
+    material = ("material",) if table.bleeding is not None and table.bleeding.part.reads_material else ()
+    return ("transfer", "volume", "clipping", *material)
 
 
 def fit_scene(config: Config, scene: Scene, precompute: Precompute) -> Scene:
@@ -82,19 +78,21 @@ def _fits(config: Config, *parts: str) -> bool:
     return fit is not None and any(name.replace("[", ".").split(".")[0] in parts for name in fit.unknowns)
 
 
-def _environment(config: Config, key: str, table: AnyEnvironment) -> EnvironmentLight:
-    keywords = table.given()
-    rotation, clamped, scale = keywords.pop("rotation"), keywords.pop("clamped", True), keywords.pop("scale", 1.0)
+def _environment(config: Config, key: str, table: EnvironmentTable) -> EnvironmentLight:
+    is_image = isinstance(table, ImageTable)
+    light = _image(config, key, table) if is_image else made(config.where, key, table, "rotation", "clamped")
     with blame(config.where(key), key):
-        if isinstance(table, ImageTable):
-            keywords.pop("source", None)
-            found = config.find(keywords.pop("path"), f"{key}.path", table.source)
-            with blame(config.where(f"{key}.path"), f"{key}.path"):
-                light = EnvironmentLight.from_image(found, **keywords)
-        else:
-            light = (EnvironmentLight.constant if table.kind == "constant" else EnvironmentLight.disc)(**keywords)
-        light = EnvironmentLight(scale * light.coefficients, clamped=clamped)
-        return light.rotated(_rotation(rotation)) if rotation else light
+        light = EnvironmentLight(light.coefficients, clamped=table.clamped is not False)
+        return light.rotated(_rotation(table.rotation)) if table.rotation else light
+
+
+def _image(config: Config, key: str, table: ImageTable) -> EnvironmentLight:
+    place = f"{key}.path"
+    image = config.find(table.path, place, table.source)
+    keywords = {name: value for name, value in table.given().items() if name not in ImageTable.model_fields}
+    with blame(config.where(place), place):
+        light = EnvironmentLight.from_image(image, **keywords)
+    return EnvironmentLight(table.scale * light.coefficients)
 
 
 def _rotation(turns: list[RotationTable]) -> np.ndarray:

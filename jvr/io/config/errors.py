@@ -87,7 +87,7 @@ def key_of(loc: Sequence[int | str], data: Any, last: str | None = None) -> str:
 
 def _is_alternative(part: str, data: Any) -> bool:
     """Whether a part of a place is no key, but the alternative that pydantic tried: a kind of table, or in parentheses."""
-    kind = data.get("kind", "perspective") if isinstance(data, dict) else data
+    kind = data.get("kind") if isinstance(data, dict) else data
     return part == kind or part.startswith("(")
 
 

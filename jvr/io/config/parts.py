@@ -5,6 +5,8 @@ from typing import Any
 
 from jvr.io.config.errors import blame
 from jvr.io.config.schema.parts import PartTable
+from jvr.io.kinds import kind_of
+from jvr.model.parameters import declared
 
 
 def made(where: Callable[[str], str], key: str, table: PartTable, *without: str) -> Any:
@@ -16,6 +18,21 @@ def made(where: Callable[[str], str], key: str, table: PartTable, *without: str)
     keywords = {name: _value(where, f"{key}.{name}", value) for name, value in given.items()}
     with blame(where(key), key):
         return table.part(**keywords)
+
+
+def choices_of(part: Any) -> dict[str, Any]:
+    """The static choices of an object by the keys of its table, and those of the parts in it, of which one without any is the name of its
+    kind."""
+    found: dict[str, Any] = {}
+    for name, field in declared(type(part)).items():
+        value = getattr(part, name)
+        kind = kind_of(value)
+        if kind is not None:
+            inner = choices_of(value)
+            found[name] = {"kind": kind} | inner if inner else kind
+        elif field.metadata.get("static"):
+            found[name] = value
+    return found
 
 
 def _value(where: Callable[[str], str], key: str, value: Any) -> Any:

@@ -4,19 +4,17 @@ A parameter that is left out has the default of its class in jvr.
 """
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Discriminator, Field, PlainValidator, Tag, model_validator
 
-from jvr.io.config.checks import number, number_or_triple, numbers, problem, whole
-from jvr.io.config.schema.parts import BASES, WRITTEN, PartTable, checked_table, part, table_of
-from jvr.io.config.schema.table import Positions, Steepness, Table, named
+from jvr.io.config.checks import number, numbers, problem
+from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, PartTable, checked_table, part, table_of
+from jvr.io.config.schema.table import Positions, Steepness, Table, one_or_more
 from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
+from jvr.model.environment import EnvironmentLight
 from jvr.model.material import AbstractBRDF
-from jvr.model.ranges import DEGREES, DIRECTION, NOT_NEGATIVE, POSITIVE, Interval
-
-Radiance = Annotated[Any, number_or_triple("radiance", NOT_NEGATIVE)]
-Order = Annotated[int, whole("order of the harmonics", Interval(0, 10))]
+from jvr.model.ranges import DIRECTION, NOT_NEGATIVE
 
 
 class RotationTable(Table):
@@ -26,59 +24,29 @@ class RotationTable(Table):
     degrees: Annotated[float, number("angle in degrees")]
 
 
-def _one_or_more(value: Any) -> Any:
-    return value if isinstance(value, list) else [value]
+Rotations = Annotated[list[RotationTable], BeforeValidator(one_or_more)]
 
 
-Rotations = Annotated[list[RotationTable], BeforeValidator(_one_or_more)]
-
-
-class AroundTable(Table):
-    """What all environments have: how they are turned, one turn after the other."""
+class EnvironmentTable(KindTable):
+    """What all environments have: how they are turned, one turn after the other, and whether negative radiance is cut off."""
 
     rotation: Rotations = Field(default=[])
     clamped: bool | None = None
 
 
-class ImageTable(AroundTable):
-    """`jvr.EnvironmentLight.from_image`."""
+class ImageTable(EnvironmentTable):
+    """Where the map of an environment lies."""
 
-    kind: Literal["image"]
     path: str
     source: str | None = None
     scale: Annotated[float, number("factor between the map's radiance and the scene's", NOT_NEGATIVE)] = 1.0
-    order: Order | None = None
-    window: Annotated[float, number("band from which nothing is left", POSITIVE)] | None = None
 
 
-class ConstantTable(AroundTable):
-    """`jvr.EnvironmentLight.constant`."""
-
-    kind: Literal["constant"]
-    radiance: Radiance | None = None
-    order: Order | None = None
+BASES |= {EnvironmentLight: EnvironmentTable, (EnvironmentLight, "image"): ImageTable}
+Environments = Annotated[list[Annotated[Any, part(EnvironmentLight)]], BeforeValidator(one_or_more)]
 
 
-class RoundTable(AroundTable):
-    """`jvr.EnvironmentLight.disc`."""
-
-    kind: Literal["disc"]
-    towards: Annotated[list[float], numbers(3, "x, y, z, from the scene to the light")]
-    half_angle: Annotated[float, number("degrees from the middle to the rim", DEGREES)]
-    radiance: Radiance | None = None
-    order: Order | None = None
-
-
-def _environments(value: Any) -> Any:
-    """One table or name, or a list of them."""
-    return [named(table) for table in _one_or_more(value)]
-
-
-AnyEnvironment = ImageTable | ConstantTable | RoundTable
-Environments = Annotated[list[Annotated[AnyEnvironment, Field(discriminator="kind")]], BeforeValidator(_environments)]
-
-
-class MaterialTable(PartTable):
+class MaterialTable(KindTable):
     """What all materials have. With a threshold they are projected on harmonics when the file is read."""
 
     threshold: Steepness | None = None
@@ -149,7 +117,7 @@ def _dipole(value: Any) -> PartTable:
     return checked_table(table_of(Dipole), value)
 
 
-class RadianceTransferTable(PartTable):
+class RadianceTransferTable(KindTable):
     """What a radiance transfer takes besides its own keys. `frozen`: whether a fit keeps what was computed for its start though its
     unknowns change it."""
 

@@ -10,8 +10,8 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from jvr.io.config.checks import increasing, number_or_triple, numbers, numbers_or_triples, problem, whole
 from jvr.io.config.errors import shown
-from jvr.io.config.schema.parts import WRITTEN, PartTable, part
-from jvr.io.config.schema.table import Length, Position, named
+from jvr.io.config.schema.parts import WRITTEN, KindTable, part
+from jvr.io.config.schema.table import Length, Position, one_or_more
 from jvr.io.kinds import KINDS
 from jvr.model.effects import AbstractScattering, AbstractShading, AbstractShadows
 from jvr.model.light import AbstractEmitter
@@ -20,7 +20,7 @@ from jvr.model.phase import AbstractPhase
 from jvr.model.ranges import AT_LEAST_ONE, DIRECTION, NOT_NEGATIVE
 
 
-class AreaTable(PartTable):
+class AreaTable(KindTable):
     """What luminous balls and discs share: as many point lights as `samples`, at places drawn with `seed`."""
 
     position: Position
@@ -65,7 +65,7 @@ def _from_0_to_180(value: list[float]) -> list[float]:
     return increasing(value)
 
 
-class TabulatedTable(PartTable):
+class TabulatedTable(KindTable):
     """`jvr.TabulatedPhase`."""
 
     degrees: Annotated[list[float], numbers(None, "angles in degrees"), AfterValidator(_from_0_to_180)]
@@ -81,12 +81,7 @@ class TabulatedTable(PartTable):
 WRITTEN[AbstractPhase] = {"tabulated": TabulatedTable}
 
 
-def _each(value: Any) -> Any:
-    """One table or name, or a list of them."""
-    return value if isinstance(value, list) else [value]
-
-
-def casts_shadows(light: PartTable) -> bool:
+def casts_shadows(light: KindTable) -> bool:
     """Whether a light of this table does; luminous balls and discs do."""
     return getattr(light.part, "casts_shadows", True)
 
@@ -103,10 +98,10 @@ def _one_method(value: Any) -> Any:
         raise problem(f'{names} exclude each other: keep one of them, such as [shadows] kind = "{methods[0]}"')
     if methods:
         raise problem(f'must be a table with a kind, such as [shadows] kind = "{methods[0]}", not {shown(value)}')
-    return named(value)
+    return value
 
 
-Lights = Annotated[list[Annotated[Any, part(AbstractEmitter)]], BeforeValidator(_each), Field(validate_default=True)]
+Lights = Annotated[list[Annotated[Any, part(AbstractEmitter)]], BeforeValidator(one_or_more), Field(validate_default=True)]
 Shading = Annotated[Any, part(AbstractShading)]
 Shadows = Annotated[Any, part(AbstractShadows), BeforeValidator(_one_method)]
 Scattering = Annotated[Any, part(AbstractScattering, "single")]

@@ -5,40 +5,49 @@ A place that takes a part of a scene, such as a phase function, takes a table wi
 when a file names it, so that no class is imported that no file names.
 """
 
+import dataclasses
 import functools
 import inspect
+import json
 import typing
 from collections.abc import Callable
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import Discriminator, PlainValidator, Tag, ValidationError, create_model, model_validator
 
 from jvr.io.config.checks import number, number_or_triple, numbers, numbers_or_triples, problem, whole
 from jvr.io.config.errors import first_complaint, shown, unknown_choice
 from jvr.io.config.schema.table import Colour, Table, named
-from jvr.io.kinds import KINDS, class_named
+from jvr.io.kinds import KINDS, maker_of
 from jvr.model.by_value import ByValue
 from jvr.model.parameters import Shape, alternatives, declared, parts_of, shapes_of
 from jvr.model.ranges import COLOUR, NOT_NEGATIVE, Interval
 
 
 class PartTable(Table):
-    """A table of a part of a scene. `part`: what is called with the keys that are given, its class or a function; tables without one are
-    made into something where they are used."""
+    """A table of a part of a scene.
+
+    - `part`: what is called with the keys that are given, its class or a function; tables without one are made into something where they
+      are used.
+    - `found`: arguments that a table may leave out though a constructor needs them, as they are found elsewhere then; `unsaid`: those
+      that it has no keys for, as its other keys say them.
+    """
 
     part: ClassVar[Callable[..., Any]]
-
-    kind: str | None = None
+    found: ClassVar[tuple[str, ...]] = ()
+    unsaid: ClassVar[tuple[str, ...]] = ()
 
     @model_validator(mode="after")
     def _lengths(self) -> "PartTable":
         """Lists of one length are as long as each other."""
         lengths: dict[str, tuple[str, int]] = {}
-        cls = getattr(self, "part", None)
-        for name, field in declared(cls).items() if isinstance(cls, type) else ():
+        for name, field in declared(getattr(self, "part", None)).items():
             shape, least = shapes_of(field)[0], field.metadata["parameter"].least
             _compare_lengths(getattr(self, name, None), shape, name, least, lengths)
         return self
+
+
+Checked = TypeVar("Checked", bound=PartTable)
 
 
 def _compare_lengths(value: Any, shape: Shape, name: str, least: int, lengths: dict[str, tuple[str, int]]) -> None:
@@ -54,38 +63,65 @@ def _compare_lengths(value: Any, shape: Shape, name: str, least: int, lengths: d
         _compare_lengths(row, shape[1:], f"{name}[{i}]", least, lengths)
 
 
-# Tables of kinds that say something else than the arguments of a class, and what all tables of a family have besides.
-WRITTEN: dict[type, dict[str, type[PartTable]]] = {}
-BASES: dict[type, type[PartTable]] = {}
+class KindTable(PartTable):
+    """A table that says what kind of part it describes."""
+
+    kind: str | None = None
+
+
+# Tables of kinds that say something else than the arguments of a class, and what all tables of a family, or of one of its kinds, have
+# besides.
+WRITTEN: dict[type, dict[str, type[KindTable]]] = {}
+BASES: dict[type | tuple[type, str], type[KindTable]] = {}
 
 
 def part(family: type, default: str | None = None) -> PlainValidator:
     """A table of one of the kinds of a family, or the name of a kind; `default`: the kind of a table that names none."""
-    return PlainValidator(lambda value: checked_table(_table_for(family, default, _keys(named(value))), named(value)))
+    return PlainValidator(lambda value: _part(family, default, value))
+
+
+def _part(family: type, default: str | None, value: Any) -> KindTable:
+    kinds = kinds_of(family)
+    if isinstance(value, str):
+        if value not in kinds:
+            raise problem(unknown_choice(value, kinds))
+        value = named(value)
+    if not isinstance(value, dict):
+        raise problem(f"must be a table of keys, or one of {', '.join(map(repr, kinds))}, not {shown(value)}")
+    kind = value.get("kind", default)
+    if kind is None:
+        raise problem("missing; it says what this table describes", "kind")
+    if kind not in kinds:
+        raise problem(unknown_choice(kind, kinds), "kind")
+    table = table_for(family, kind)
+    for key in value:
+        others = [] if key in table.model_fields else [k for k in kinds if key in table_for(family, k).model_fields]
+        if others:
+            raise problem(f"unknown key; only kind = {' or '.join(map(json.dumps, others))} has it", key)
+    return checked_table(table, value)
+
+
+def kinds_of(family: type) -> list[str]:
+    """What the kinds of a family are called."""
+    return [*KINDS[family], *WRITTEN.get(family, {})]
+
+
+def table_for(family: type, kind: str) -> type[KindTable]:
+    """The table of a kind."""
+    written = WRITTEN.get(family, {})
+    base = BASES.get((family, kind), BASES.get(family, KindTable))
+    return written[kind] if kind in written else table_of(maker_of(family, kind), base)
 
 
 def only(cls: type, *names: str) -> PlainValidator:
     """A table of a class, in a place that takes no other; `names`: of its keys, where they are not all parameters of the class."""
-    return PlainValidator(lambda value: checked_table(table_of(cls, PartTable, names), _keys(value)))
+    return PlainValidator(lambda value: checked_table(table_of(cls, PartTable, names), value))
 
 
-def _keys(value: Any) -> dict[str, Any]:
+def checked_table(table: type[Checked], value: Any) -> Checked:
+    """The table of these keys; what is wrong with them is one problem that names its key."""
     if not isinstance(value, dict):
         raise problem(f"must be a table of keys, not {shown(value)}")
-    return value
-
-
-def _table_for(family: type, default: str | None, value: dict[str, Any]) -> type[PartTable]:
-    written, kind = WRITTEN.get(family, {}), value.get("kind", default)
-    if kind is None:
-        raise problem("missing; it says what this table describes", "kind")
-    if kind not in [*KINDS[family], *written]:
-        raise problem(unknown_choice(kind, [*KINDS[family], *written]), "kind")
-    return written[kind] if kind in written else table_of(class_named(KINDS[family][kind]), BASES.get(family, PartTable))
-
-
-def checked_table(table: type[PartTable], value: dict[str, Any]) -> PartTable:
-    """The table of these keys; what is wrong with them is one problem that names its key."""
     try:
         return table.model_validate(value)
     except ValidationError as error:
@@ -95,17 +131,20 @@ def checked_table(table: type[PartTable], value: dict[str, Any]) -> PartTable:
 
 
 @functools.cache
-def table_of(cls: type, base: type[PartTable] = PartTable, names: tuple[str, ...] = ()) -> type[PartTable]:
-    """The table of a class: of its declared parameters, those that its constructor takes, that can be said in a table and, where some are
-    named, are among `names`."""
+def table_of(maker: Callable[..., Any], base: type[Checked] = PartTable, names: tuple[str, ...] = ()) -> type[Checked]:
+    """The table of a class or function: of its declared parameters, those that it takes, that can be said in a table and, where some are
+    named, are among `names`. Keys that `base` has are as they are there."""
     keys: dict[str, Any] = {}
-    for name, argument in inspect.signature(cls.__init__).parameters.items():
-        field = declared(cls).get(name)
-        kind = None if field is None or (names and name not in names) else _type_of(field)
+    for name, argument in inspect.signature(maker.__init__ if isinstance(maker, type) else maker).parameters.items():
+        field = declared(maker).get(name)
+        said = name in base.model_fields or name in base.unsaid or (names and name not in names)
+        kind = None if field is None or said else _type_of(field)
         if kind is not None:
-            keys[name] = (kind, ... if argument.default is argument.empty else None)
-    table = create_model(f"{cls.__name__}Table", __base__=base, **keys)
-    table.part = cls
+            keys[name] = (kind, ... if argument.default is argument.empty and name not in base.found else None)
+    table = create_model(f"{maker.__name__}Table", __base__=base, **keys)
+    if "part" not in vars(base):
+        # A function would become a method.
+        table.part = staticmethod(maker)
     return table
 
 
@@ -117,9 +156,11 @@ def _type_of(field: Any) -> Any:
         one = None if family is None else Annotated[Any, part(family)]
         return list[one] if one is not None and typing.get_origin(field.type) is tuple else one
     if field.metadata.get("static"):
+        most = {"high": min(about.within.high, about.most)} if isinstance(about.within, Interval) else {}
+        within = dataclasses.replace(about.within, **most)
         if float in kinds:
-            return Annotated[float, number(about.about, about.within)]
-        return Annotated[int, whole(about.about, about.within)] if int in kinds else field.type
+            return Annotated[float, number(about.about, within)]
+        return Annotated[int, whole(about.about, within)] if int in kinds else field.type
     # Constructors take brighter light than fits make, up to a limit of their own.
     within = NOT_NEGATIVE if isinstance(about.within, Interval) and about.within.light else about.within
     if about.within == COLOUR:

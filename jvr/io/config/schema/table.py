@@ -4,9 +4,9 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, model_validator
 
-from jvr.io.config.checks import increasing, number, numbers, numbers_or_triples, problem, whole
+from jvr.io.config.checks import increasing, number, numbers, numbers_or_triples, problem
 from jvr.io.config.errors import did_you_mean, shown
-from jvr.model.ranges import ANGLE_OF_VIEW, NOT_NEGATIVE, POSITIVE, Interval
+from jvr.model.ranges import NOT_NEGATIVE, POSITIVE
 
 
 def _no_codes(value: Any) -> Any:
@@ -26,8 +26,6 @@ Positions = Annotated[list[float], numbers(None, "in the data's own units"), Aft
 Range = Annotated[list[float], numbers(2, "low, high in the data's own units"), AfterValidator(increasing)]
 Extinctions = Annotated[list[Any], numbers_or_triples("extinction per mm", NOT_NEGATIVE)]
 Extinction = Annotated[float, number("extinction per mm", NOT_NEGATIVE)]
-Pixels = Annotated[int, whole("pixels", Interval(1, 65_536))]
-Angle = Annotated[float, number("full vertical angle in degrees", ANGLE_OF_VIEW)]
 Steepness = Annotated[float, number("length of a gradient, data units per mm", NOT_NEGATIVE)]
 
 
@@ -61,6 +59,11 @@ class Table(BaseModel):
         for other in others:
             if len(getattr(self, other)) != count:
                 raise problem(f"has {len(getattr(self, other))} entries, {first} has {count}: give as many", other)
+
+
+def one_or_more(value: Any) -> Any:
+    """One entry, or a list of them."""
+    return value if isinstance(value, list) else [value]
 
 
 def named(value: Any) -> Any:

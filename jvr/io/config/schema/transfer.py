@@ -6,14 +6,14 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from jvr.io.config.checks import number, problem, whole
-from jvr.io.config.schema.parts import BASES, WRITTEN, PartTable, only, part
+from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, only, part
 from jvr.io.config.schema.table import Colour, Extinction, Positions, Range, Scalar, Table
 from jvr.model.gradient_transfer import GradientOpacity
 from jvr.model.ranges import POSITIVE, Interval
 from jvr.model.transfer import AbstractTransfer, LutTransfer
 
 
-class TransferTable(PartTable):
+class TransferTable(KindTable):
     """What all transfer functions of the scalar have: the gradient can scale their extinction."""
 
     gradient_opacity: Annotated[Any, only(GradientOpacity, "low", "high")] | None = None

@@ -1,6 +1,7 @@
-"""Tables of volume, camera, settings and fit, and the whole of them."""
+"""Tables of volume, cameras and fit, and the whole of them."""
 
-from typing import Annotated, Any, Literal
+import dataclasses
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -8,11 +9,18 @@ from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
 from jvr.io.config.schema.environment import Environments, Material, RadianceTransfer
 from jvr.io.config.schema.light import Lights, Normals, Scattering, Shading, Shadows, casts_shadows
-from jvr.io.config.schema.parts import only
-from jvr.io.config.schema.table import Angle, Colour, Extinction, Length, Pixels, Position, Range, Scalar, Table, named
+from jvr.io.config.schema.parts import BASES, KindTable, only, part
+from jvr.io.config.schema.table import Colour, Extinction, Position, Range, Scalar, Table, one_or_more
 from jvr.io.config.schema.transfer import Transfer
+from jvr.io.kinds import maker_of
+from jvr.model.camera import AbstractCamera
 from jvr.model.clipping import ClippingBox
-from jvr.model.ranges import AT_LEAST_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, TRANSMITTANCE, UNIT_INTERVAL, Interval
+from jvr.model.interpolation import AbstractInterpolation
+from jvr.model.optical import AbstractOpticalModel
+from jvr.model.parameters import declared
+from jvr.model.ranges import AT_LEAST_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL, Interval
+from jvr.rendering.integrator import AbstractIntegrator
+from jvr.rendering.settings import Settings
 
 
 class VolumeTable(Table):
@@ -35,7 +43,7 @@ class VolumeTable(Table):
     time: Annotated[int, whole("index of a point in time", NOT_NEGATIVE)] | None = None
     missing: Scalar | Literal[False] | None = None
     nan_value: Scalar | None = None
-    interpolation: Literal["trilinear", "nearest"] = "trilinear"
+    interpolation: Annotated[Any, part(AbstractInterpolation)] | None = None
     scale: Range | None = None
     packed: bool = False
 
@@ -45,24 +53,26 @@ class VolumeTable(Table):
         return self
 
 
-class CameraTable(Table):
+class CameraTable(KindTable):
     """What all cameras share. `frame`: what a camera whose place is left out shows whole: the box of the volume, or what the transfer
     function leaves visible of it."""
 
+    found: ClassVar[tuple[str, ...]] = ("fov_y", "height_world", "radius", "width", "height")
+    unsaid: ClassVar[tuple[str, ...]] = ("world_from_camera", "center")
+
     frame: Literal["box", "visible"] = "box"
     target: Position | None = None
-    width: Pixels = 512
-    height: Pixels = 512
 
-
-View = Literal["oblique", "front", "back", "left", "right", "top", "bottom"]
+    def keywords(self) -> dict[str, Any]:
+        """What it says of the arguments of its class."""
+        return {name: value for name, value in self.given().items() if name in declared(self.part)}
 
 
 class SingleTable(CameraTable):
-    """One camera: where it is, or from which side of the patient (x to the left, y to the back, z up) it looks at all there is."""
+    """Where one camera is, or from which side of the patient (x to the left, y to the back, z up) it looks at all there is."""
 
     eye: Position | None = None
-    view: View | None = None
+    view: Literal["oblique", "front", "back", "left", "right", "top", "bottom"] | None = None
     up: Position | None = None
 
     @model_validator(mode="after")
@@ -72,87 +82,38 @@ class SingleTable(CameraTable):
         return self
 
 
-class PerspectiveTable(SingleTable):
-    """`jvr.PerspectiveCamera`; without `eye`, a view from the front, above and to the side that shows the whole volume."""
-
-    kind: Literal["perspective"]
-    fov_y: Angle = 30.0
-
-
-class OrthographicTable(SingleTable):
-    """`jvr.OrthographicCamera`."""
-
-    kind: Literal["orthographic"]
-    height_world: Length | None = None
-
-
 class RigTable(CameraTable):
-    """Several cameras around the target: `jvr.fibonacci_sphere` or `jvr.orbit`."""
+    """Several cameras around the target; their angle of view may be said by its tangent."""
 
-    kind: Literal["fibonacci", "orbit"]
-    count: Annotated[int, whole("cameras", Interval(1, 10_000))]
-    radius: Length | None = None
-    fov_y: Angle | None = None
     half_angle_tangent: Annotated[float, number("tangent of half the vertical angle", POSITIVE)] | None = None
-    axis: Position | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "RigTable":
-        if self.fov_y is not None and self.half_angle_tangent is not None:
+        if self.half_angle_tangent is not None and "fov_y" in self.given():
             raise problem("excludes fov_y: give one of the two", "half_angle_tangent")
-        if self.axis is not None and self.kind != "orbit":
-            raise problem('only kind = "orbit" has an axis', "axis")
         return self
 
 
-def _cameras(value: Any) -> Any:
-    """One table or a list of them; perspective unless they say otherwise."""
-    tables = value if isinstance(value, list) else [value]
-    return [{"kind": "perspective", **table} if isinstance(table, dict) else table for table in tables]
+BASES |= {AbstractCamera: SingleTable, (AbstractCamera, "fibonacci"): RigTable, (AbstractCamera, "orbit"): RigTable}
+Camera = Annotated[Any, part(AbstractCamera, "perspective")]
+Cameras = Annotated[list[Camera], BeforeValidator(one_or_more), Field(min_length=1, validate_default=True)]
 
 
-AnyCamera = Annotated[PerspectiveTable | OrthographicTable | RigTable, Field(discriminator="kind")]
-Cameras = Annotated[list[AnyCamera], BeforeValidator(_cameras), Field(min_length=1)]
+class SlicesTable(KindTable):
+    """`tolerance`: that of the oracle, which may also be said in a table of its own,
+    `oracle = { kind = "brick-range", tolerance = 0.02 }`."""
+
+    tolerance: Annotated[float, number("opacity and radiance of one voxel", POSITIVE)] | None = None
+
+    @staticmethod
+    def part(tolerance: float | None = None, **keywords: Any) -> Any:
+        slices = maker_of(AbstractIntegrator, "slices")(**keywords)
+        if tolerance is None or "tolerance" not in declared(type(slices.oracle)):
+            return slices
+        return dataclasses.replace(slices, oracle=dataclasses.replace(slices.oracle, tolerance=tolerance))
 
 
-class UniformTable(Table):
-    """`jvr.Uniform`."""
-
-    kind: Literal["uniform"]
-
-
-class SlicesTable(Table):
-    """`jvr.Slices`."""
-
-    kind: Literal["slices"]
-    oracle: Literal["local-error", "opacity-change", "brick-range", "finest"] = "local-error"
-    tolerance: Annotated[float, number("opacity and radiance of one voxel", POSITIVE)] = 0.01
-    levels: Literal[0, 1, 2, 3, 4, 5] = 3
-
-
-class RefinementTable(Table):
-    """`jvr.Refinement`."""
-
-    kind: Literal["refinement"]
-    tolerance: Annotated[float, number("radiance and opacity, 0 for every ray", NOT_NEGATIVE)] = 0.005
-    tile: Literal[2, 4, 8, 16, 32, 64] = 8
-
-
-AnySampling = Annotated[UniformTable | SlicesTable | RefinementTable, Field(discriminator="kind")]
-Sampling = Annotated[AnySampling, BeforeValidator(named)]
-
-
-class SettingsTable(Table):
-    """`jvr.Settings`."""
-
-    step: Annotated[float, number("length of a step in voxels of the smallest spacing", POSITIVE)] = 0.5
-    termination: Annotated[float, number("transmittance at which a ray ends, 0 for never", TRANSMITTANCE)] = 1e-4
-    quadrature: Literal["midpoint", "pre-integrated"] = "midpoint"
-    skipping: bool = True
-    negligible: Annotated[float, number("optical depth that a ray may leave out, 0 for none", TRANSMITTANCE)] = 0.0
-    tile: Annotated[int, whole("rays at a time", AT_LEAST_ONE)] = 262_144
-    adjoint: Literal["replay", "forward", "rows"] = "replay"
-    sampling: Sampling = UniformTable(kind="uniform")
+BASES[AbstractIntegrator, "slices"] = SlicesTable
 
 
 class StartTable(Table):
@@ -228,7 +189,7 @@ class ConfigTable(Table):
     transfer: Transfer | None = None
     truth: Transfer | None = None
     background: Colour | None = None
-    optical: Literal["emission-absorption", "emission-only", "absorption-only"] = "emission-absorption"
+    optical: Annotated[Any, part(AbstractOpticalModel)] | None = None
     clipping: Annotated[Any, only(ClippingBox)] | None = None
     lights: Lights = Field(default=[])
     shading: Shading | None = None
@@ -238,8 +199,8 @@ class ConfigTable(Table):
     environment: Environments = Field(default=[])
     material: Material | None = None
     radiance_transfer: RadianceTransfer | None = None
-    camera: Cameras = Field(default=[PerspectiveTable(kind="perspective")])
-    settings: SettingsTable = SettingsTable()
+    camera: Cameras = Field(default=[{}])
+    settings: Annotated[Any, only(Settings)] = Field(default={}, validate_default=True)
     fit: FitTable | None = None
 
     @model_validator(mode="after")
