@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jvr.effects.light_space import AbstractLightSpace, bilinear, light_space, of_swept
 from jvr.effects.shadow_volume import texels
-from jvr.march.medium import AbstractVisibility, Medium
+from jvr.march.medium import AbstractVisibility, LightPath
 from jvr.march.steps import Point, Transmittances
 from jvr.model.effects import AbstractShadows
 from jvr.model.parameters import assign, choice
@@ -43,9 +43,9 @@ class DeepShadowMap(AbstractShadows):
     def __init__(self, texels: int = 128, layers: int = 12, *, error: float = 0.01):
         assign(self, texels=texels, layers=layers, error=error)
 
-    def visibility(self, scene: Scene, medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, path: LightPath) -> AbstractVisibility:
         steps = max(self.layers, math.ceil(math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape))))
-        maps = []
+        maps, medium = [], path(scene.transfer.takes_gradient)
         for light in scene.shadow_casters:
             space = None if light is None else light_space(light, scene.volume)
             if space is None:

@@ -14,16 +14,34 @@ import jax
 import jax.numpy as jnp
 
 from jvr.effects.cut import CutFaces
+from jvr.effects.environment_lighting import EnvironmentLighting, environment_lighting_of
 from jvr.effects.self_shadow import ShadedSegment
 from jvr.effects.shading import surface_weight
-from jvr.march.shaders import OpticalShader, PreIntegratedShader, where_known
+from jvr.march.shaders import GradientFrame, OpticalShader, PreIntegratedShader, where_known
 from jvr.march.steps import Point, Sample
 from jvr.model.by_value import at_value
 from jvr.model.effects import AbstractScattering, AbstractShading
 from jvr.model.light import AbstractEmitter, AbstractLight, AmbientLight
+from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
 from jvr.numerics import direction_and_length, transformed, turned
 from jvr.types import Affine, Channels, Scalar, Triple
+
+
+def prepare(scene: Scene) -> EnvironmentLighting | None:
+    """What is computed once for all rays through a scene that shows light: its material under environment lighting."""
+    return None if scene.material is None else environment_lighting_of(scene)
+
+
+def lit_shader(
+    scene: Scene, frame: GradientFrame | None, prepared: EnvironmentLighting | None, *, pre_integrated: bool
+) -> "LitShader":
+    """The shader of a scene that shows light; `frame`: how gradients come about, where something asks for them."""
+    kind = LitPreIntegratedShader if pre_integrated else LitShader
+    cut, volume = None, scene.volume
+    if scene.clipping is not None and frame is not None:
+        cut = CutFaces(scene.clipping, jnp.min(volume.spacing))
+    return kind(scene.optical, frame, volume.world_from_grid, scene.lights, scene.shading, scene.scattering, cut, prepared)
 
 
 class LitShader(OpticalShader):
@@ -34,7 +52,7 @@ class LitShader(OpticalShader):
     shading: AbstractShading | None
     scattering: AbstractScattering | None
     cut: CutFaces | None = None  # where surfaces are clipped
-    environment: Any = None  # a `jvr.effects.environment_lighting.EnvironmentLighting`, where the scene has an environment
+    environment: EnvironmentLighting | None = None
 
     def shade(self, classified: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         factor, added = self.light_at(sample, point, classified, dt)

@@ -108,6 +108,10 @@ class RadianceTransferProjection(eqx.Module):
     def positions(self) -> np.ndarray:
         return node_positions(self.volume, self.radiance_transfer.shape(self.volume))
 
+    def all_nodes(self) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
+        """`project_all` of it."""
+        return project_all(self)
+
     def nodes(self, index: Int[Array, "nodes"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
         """The radiance transfer of some nodes, a chunk at a time."""
         fill = -index.shape[0] % CHUNK

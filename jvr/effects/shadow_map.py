@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from jvr.effects.light_space import AbstractLightSpace, depth_nodes, light_space
 from jvr.effects.shadow_volume import samples_a_layer, texels
-from jvr.march.medium import AbstractVisibility, Medium
+from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Transmittances
 from jvr.model.effects import AbstractShadows
 from jvr.model.parameters import assign, choice
@@ -41,8 +41,9 @@ class ShadowMap(AbstractShadows):
     def __init__(self, texels: int = 256, *, threshold: float = 0.5, softness: int = 1, bias: float | int = 1.5):
         assign(self, texels=texels, threshold=threshold, softness=softness, bias=bias)
 
-    def visibility(self, scene: Scene, medium: Medium, spacing: Scalar) -> AbstractVisibility:
-        maps = []
+    def visibility(self, scene: Scene, path: LightPath) -> AbstractVisibility:
+        medium = path(scene.transfer.takes_gradient)
+        spacing, maps = jnp.min(scene.volume.spacing), []
         for light in scene.shadow_casters:
             space = None if light is None else light_space(light, scene.volume)
             maps.append(None if space is None else self._map(space, scene, medium, spacing))

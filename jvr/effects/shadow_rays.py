@@ -9,7 +9,7 @@ from jvr.effects.shadow_volume import ShadowVolume
 from jvr.march.adjoint import replay_march
 from jvr.march.fields import VoxelField
 from jvr.march.march import Marched, MarchOptions, march
-from jvr.march.medium import AbstractVisibility, Medium
+from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Rays, Transmittances
 from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractShadows
@@ -41,9 +41,10 @@ class ShadowRays(AbstractShadows):
     def __init__(self, step: float | int = 1.0, *, termination: float | int = 1e-3):
         assign(self, step=step, termination=termination)
 
-    def visibility(self, scene: Scene, medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, path: LightPath) -> AbstractVisibility:
         options = MarchOptions(self.termination, distance=False)
-        return RayVisibility(scene.clipping, scene.shadow_casters, medium, self.step * spacing, options)
+        medium = path(scene.transfer.takes_gradient)
+        return RayVisibility(scene.clipping, scene.shadow_casters, medium, self.step * jnp.min(scene.volume.spacing), options)
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
         return (multiples("step", self.step, (4, 2, 1, 1 / 2), 1 / 4),)

@@ -6,6 +6,7 @@ into emitted radiance and optical depth, and where the scene asks for it, how mu
 
 import abc
 import functools
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -101,6 +102,10 @@ class Medium(NamedTuple):
     shader: AbstractShader
     occupancy: Occupancy | None = None
     visibility: AbstractVisibility | None = None
+
+
+# What light passes on its way to a point: a medium that emits nothing, with gradients where that is asked for (`True`).
+LightPath = Callable[[bool], Medium]
 
 
 def for_derivatives(medium: Medium, wanted: Medium, moved: Any = None) -> Medium:

@@ -84,9 +84,8 @@ class AbstractShadows(AbstractPart):
         return scene.replaced(shadows=None)
 
     @abc.abstractmethod
-    def visibility(self, scene: Any, medium: Any, spacing: Scalar) -> Any:
-        """A `jvr.march.medium.AbstractVisibility` of the scene's lights, made once for a picture; differentiable. `medium`: what light
-        passes through, a `jvr.march.medium.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""
+    def visibility(self, scene: Any, path: Any) -> Any:
+        """That of the scene's lights, as `AbstractPart.visibility`."""
 
 
 class AbstractMaterial(AbstractPart):
@@ -126,6 +125,8 @@ class AbstractRadianceTransfer(AbstractPart):
     bleeding: eqx.AbstractVar[Any]
     # Highest order of its harmonics.
     order: eqx.AbstractVar[int]
+    # What scatters light between nodes, or `None`.
+    scattering: eqx.AbstractVar[Any]
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         made = "computed beforehand" if self.is_frozen else "computed in each picture: jvr.precompute"
@@ -151,6 +152,23 @@ class AbstractRadianceTransfer(AbstractPart):
     @abc.abstractmethod
     def is_final(self) -> bool:
         """Whether a picture has nothing left to do but to multiply it with the light."""
+
+    @abc.abstractmethod
+    def visibility(self, scene: Any, path: Any) -> Any:
+        """That of the scene's environment, as `AbstractPart.visibility`."""
+
+    @abc.abstractmethod
+    def projection(self, scene: Any, path: Any) -> Any:
+        """All that is needed to compute it, a pytree: `active()`, a mask of nodes that are worth it; `nodes(index)`, what some of them are;
+        `all_nodes()`, what all are. `path`: as of `visibility`."""
+
+    @abc.abstractmethod
+    def finished(self, scene: Any, *nodes: Any) -> Any:
+        """What `with_projected` takes, from what all nodes of the scene's projection are."""
+
+    @abc.abstractmethod
+    def with_projected(self, projected: Any) -> "AbstractRadianceTransfer":
+        """The same, computed beforehand."""
 
     @abc.abstractmethod
     def transfer_function(self, scene: Any) -> Any:

@@ -538,7 +538,7 @@ class Fractions(AbstractVisibility):
 
 
 class FractionalShadows(AbstractShadows):
-    def visibility(self, scene, medium, spacing):
+    def visibility(self, scene, path):
         return Fractions()
 
 
