@@ -5,6 +5,25 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+
+class Renamed:
+    """What an attribute of a class was called before, for one release: it warns, and is what the attribute is under its new name."""
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.before = name
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        warnings.warn(
+            f"{owner.__name__}.{self.before} is called {self.name}; the next release knows that name alone",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return getattr(owner if instance is None else instance, self.name)
+
+
 NAMES = {
     "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
     "jvr.effects.radiance_transfer": ("MaterialBleeding", "RadianceTransfer", "TransferBleeding"),

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.model.ranges import Entries, Increasing, Interval, Range, UnitVector
+from jvr.names import Renamed
 from jvr.numerics import normalise, rounded_into
 
 # How near to the end of its range a start value may lie: at the end itself a smooth map has no slope and the fit cannot leave.
@@ -26,6 +27,8 @@ Bounds = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
 
 class AbstractBijector(eqx.Module):
     """A map from unconstrained numbers, within bounds, onto the values that an unknown may take."""
+
+    reach = Renamed("trust_radius")
 
     @abc.abstractmethod
     def forward(self, unconstrained: Float[Array, "..."]) -> Float[Array, "..."]:

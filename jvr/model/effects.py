@@ -7,11 +7,15 @@ from typing import Any, ClassVar
 import equinox as eqx
 
 from jvr.model.parts import AbstractPart, PlanEntry, spelling
+from jvr.names import Renamed
 from jvr.types import Channels, Scalar, Triple
 
 
 class AbstractShading(AbstractPart):
     """Local shading: how a surface reflects light."""
+
+    ambient_share, surface_share = Renamed("ambient_reflectance"), Renamed("surface_weight")
+    gloss = Renamed("specular_lobe")
 
     @property
     def needs_gradient(self) -> bool:
@@ -44,6 +48,8 @@ class AbstractShading(AbstractPart):
 class AbstractScattering(AbstractPart):
     """Single scattering: how the medium scatters light."""
 
+    share = Renamed("medium_weight")
+
     @property
     @abc.abstractmethod
     def needs_gradient(self) -> bool:
@@ -75,6 +81,8 @@ class AbstractScattering(AbstractPart):
 
 class AbstractShadows(AbstractPart):
     """A shadow algorithm: a way to find the transmittance between lights and points."""
+
+    prepared = Renamed("visibility")
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         casting = sum(light is not None for light in scene.shadow_casters)
@@ -127,6 +135,8 @@ class AbstractRadianceTransfer(AbstractPart):
     order: eqx.AbstractVar[int]
     # What scatters light between nodes, or `None`.
     scattering: eqx.AbstractVar[Any]
+
+    outdated, made_for = Renamed("stale"), Renamed("cache_key")
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         made = "computed beforehand" if self.is_frozen else "computed in each picture: jvr.precompute"

@@ -19,6 +19,7 @@ from jvr.model.exact import Exact, Remainder, in_double
 from jvr.model.parameters import GREY_OR_RGB, assign, declared, parameter
 from jvr.model.parts import AbstractPart, PlanEntry, is_zero
 from jvr.model.ranges import DEGREES, DIRECTION, NOT_NEGATIVE, POSITIVE, RADIANCE, Entries
+from jvr.names import Renamed
 from jvr.numerics import direction_and_length, divide_or_zero
 from jvr.types import ArrayLike, Scalar, Triple, Vector
 
@@ -74,6 +75,8 @@ class AbstractLight(AbstractEmitter):
 
     # Whether what is between the light and a point can shade it.
     casts_shadows: ClassVar[bool] = True
+
+    arrives = Renamed("sample")
 
     @abc.abstractmethod
     def sample(self, x: Triple, w_o: Triple) -> LightSample:

@@ -22,6 +22,7 @@ from jvr.model.effects import AbstractMaterial
 from jvr.model.harmonics.basis import basis
 from jvr.model.parameters import assign, parameter
 from jvr.model.ranges import INCREASING, NOT_NEGATIVE
+from jvr.names import Renamed
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 # The largest angle between the normal and the eye that materials are projected for.
@@ -113,6 +114,8 @@ class AbstractBRDF(AbstractMaterial):
 
     # What it is symmetric about, see `Lobe`.
     symmetry_axis: ClassVar[SymmetryAxis]
+
+    about = Renamed("symmetry_axis")
 
     @abc.abstractmethod
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:

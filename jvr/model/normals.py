@@ -18,6 +18,7 @@ from jvr.model.parameters import choice
 from jvr.model.parts import AbstractPart, Knob, PlanEntry, parts_of, spelling
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume, gradients_at_voxels
+from jvr.names import Renamed
 from jvr.numerics import add_runs, divide_or_zero, read_run
 from jvr.types import Channels, Scalar, Triple
 
@@ -31,6 +32,8 @@ class AbstractNormals(AbstractPart):
     else that of the scalar."""
 
     of_opacity: bool = choice(doc="whether of the extinction, not of the scalar", default=False)
+
+    prepared = Renamed("with_gradients")
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         asking = " and ".join(other for other, part in parts_of(scene) if part.needs_gradient)

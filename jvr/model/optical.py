@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.transfer import Classified
+from jvr.names import Renamed
 from jvr.numerics import one_minus_exp
 from jvr.types import Channels, Scalar
 
@@ -15,6 +16,8 @@ class AbstractOpticalModel(AbstractPart):
 
     # Whether anything is held back, so that a ray may end early.
     absorbs: ClassVar[bool] = True
+
+    segment = Renamed("evaluate_segment")
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         return (PlanEntry("optical model", True, type(self).__name__),)

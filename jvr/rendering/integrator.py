@@ -6,7 +6,9 @@ fitted, differentiated. Others choose among the rays of a picture, or share samp
 """
 
 import abc
+import dataclasses
 import math
+import warnings
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -75,6 +77,17 @@ class AbstractIntegrator(AbstractPart):
     @abc.abstractmethod
     def picture(self, view: View) -> Rendering:
         """The picture of a view; traceable. **Raises** `ValueError` for what this integrator does not support."""
+
+    def render(self, scene: Scene, camera: AbstractCamera, settings: "Settings") -> Rendering:
+        """`jvr.render` by this integrator, as it was called before; for one release, with a warning."""
+        from jvr.rendering.render import render
+
+        warnings.warn(
+            f"{type(self).__name__}.render is jvr.render(scene, camera, settings) with Settings(sampling=...)",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return render(scene, camera, dataclasses.replace(settings, sampling=self))
 
 
 class AbstractRayIntegrator(AbstractIntegrator):

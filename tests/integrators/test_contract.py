@@ -118,6 +118,13 @@ def test_its_picture_is_right_eagerly_and_in_ones_own_program():
         assert int(picture.stats.steps[0, 0]) == np.ceil(0.25 * SIDE / 0.3)
 
 
+def test_the_method_that_made_pictures_before_makes_them_with_a_warning():
+    settings = jvr.Settings(0.3, termination=0)
+    with pytest.warns(DeprecationWarning, match=r"Front\.render is jvr\.render"):
+        picture = Front(0.25).render(slab(0.6, 0.4), straight(), settings)
+    np.testing.assert_allclose(picture.rgb[1, 0], brightness(0.6, 0.4, 0.25), rtol=1e-5)
+
+
 def test_its_derivatives_are_right_in_ones_own_program(x64):
     settings = jvr.Settings(0.3, termination=0, sampling=Front(0.25))
     red = lambda a, s: jvr.render(slab(a, s), straight(), settings).rgb[0, 0, 0]
