@@ -70,7 +70,7 @@ def _jacobian_march(options: MarchOptions, medium: Medium, rays: Rays, dt: Scala
 def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tuple[Marched, Marched]:
     tangents = perturbed(primals, tangents)
     medium, rays, dt = primals
-    if jax.tree.leaves(tangents[0].shadows):
+    if jax.tree.leaves(tangents[0].visibility):
         raise ValueError(
             "jvr.Rows() does not know shadows that change, nor a radiance transfer or its light: set "
             "Settings(adjoint=jvr.Replay()), or jvr.Forward() for forward mode; for a transfer function alone, jvr.precompute(scene) "
