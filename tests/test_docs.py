@@ -31,7 +31,7 @@ from jvr.march.quadrature import AbstractQuadrature
 from jvr.model.camera import AbstractCamera
 from jvr.model.effects import AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
-from jvr.model.light import AbstractEmitter
+from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
 from jvr.model.phase import AbstractPhase
@@ -162,7 +162,7 @@ def test_saved_scenes_are_valid(block, tmp_path):
 
 
 FAMILIES = {
-    "[[lights]]": AbstractEmitter,
+    "[[lights]]": AbstractLight,
     "[shading]": AbstractShading,
     "[shadows]": AbstractShadows,
     "[scattering.phase]": AbstractPhase,
