@@ -21,7 +21,8 @@ from benchmarks import scenes
 from benchmarks.peers.compiled import compiler
 from benchmarks.timing import median, seconds
 from jvr.execution.tiles import dealt_blocks, picture_of, pixels_of
-from jvr.rendering.trace import camera_rays, prepare
+from jvr.rendering.medium import prepare
+from jvr.rendering.trace import camera_rays, near_volume, step_length
 
 SOURCE = Path(__file__).with_name("march.cu")
 TERMINATION = 1e-3
@@ -47,13 +48,13 @@ class HandWritten:
     def __init__(self, scene: jvr.Scene, camera: jvr.PerspectiveCamera, settings: jvr.Settings, *, device: bool):
         self.library, self.device = _compiled(device), device
         size = self.size = (camera.height, camera.width)
-        prepared = jax.jit(prepare, static_argnums=1)(scene, settings)
-        pixels = pixels_of(dealt_blocks(*size), *size)
-        of_camera, _ = jax.jit(camera_rays, static_argnums=2)(scene, camera, settings, pixels, prepared)
+        scene, camera = near_volume(scene, camera)
+        prepared = jax.jit(prepare, static_argnums=1)(scene, settings, step_length(scene, settings))
+        inside, _ = jax.jit(camera_rays)(scene, camera, pixels_of(dealt_blocks(*size), *size))
         assert isinstance(scene.transfer, jvr.LutTransfer)
         assert prepared.occupancy is not None
         table = jnp.concatenate([scene.transfer.rgb, scene.transfer.sigma_t[:, None]], axis=1)
-        rays = jnp.stack([*of_camera.rays.entry, *of_camera.rays.direction, of_camera.rays.length])
+        rays = jnp.stack([*inside.entry, *inside.direction, inside.length])
         low, high = np.asarray(scene.transfer.domain)
         kinds = {"voxels": np.float32, "table": np.float32, "radius": np.uint8, "rays": np.float32}
         found = (scene.volume.values, table, prepared.occupancy.empty_radius, rays)
@@ -67,7 +68,7 @@ class HandWritten:
             count=rays.shape[1],
             low=low,
             high=high,
-            dt=float(of_camera.dt),
+            dt=float(prepared.dt),
             termination=settings.termination,
         )
         self.out = np.zeros((rays.shape[1], 4), np.float32)

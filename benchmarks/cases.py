@@ -22,7 +22,7 @@ from benchmarks.light import light
 from benchmarks.preparation import preparation
 from benchmarks.timing import median, ratio, seconds
 from jvr.march.march import MarchOptions, march
-from jvr.rendering.medium import medium
+from jvr.rendering.medium import Prepared, medium
 from jvr.rendering.trace import enter, step_length
 
 SIZE = 256
@@ -35,7 +35,7 @@ def forward() -> dict[str, Any]:
     camera = scenes.camera(volume, SIZE)
     rays, _ = jax.jit(lambda: enter(scene, *camera.rays(jnp.arange(SIZE * SIZE, dtype=jnp.int32))))()
     dt = step_length(scene, settings)
-    ours = jax.jit(lambda scene, rays, dt: march(MarchOptions(0.0, False), medium(scene, settings), rays, dt))
+    ours = jax.jit(lambda scene, rays, dt: march(MarchOptions(0.0, False), medium(Prepared(scene, settings, dt)), rays, dt))
     gathered = ours(scene, rays, dt)
     segments = int(gathered.steps.max())
     plain = jax.jit(lambda volume, transfer, rays, dt: yardsticks.vmapped_march(volume, transfer, rays, dt, segments))
@@ -177,7 +177,7 @@ def _measured(function: str, *arguments: str | int) -> str:
 def fitting() -> dict[str, Any]:
     """The CT head protocol (docs/fitting.md): time to 60 dB in evaluations of a plain forward march over the same kept samples."""
     from experiments.protocols import ct_head
-    from jvr.fitting.observations import keep_samples, observe, observed_medium, prepare_in_fit
+    from jvr.fitting.observations import inside, keep_samples, observe, observed_medium, prepare_in_fit
 
     protocol = ct_head()
     if protocol is None:
@@ -187,7 +187,8 @@ def fitting() -> dict[str, Any]:
     observations = observe(start, cameras, images, None, settings, chunk)
     kept = keep_samples(start, observations, settings, 2**31, clamped=True)
     assert kept is not None
-    through, rays = observed_medium(start, kept[1].tile(0), kept[0], settings, prepare_in_fit(start, settings, False))
+    tile = kept[1].tile(0)
+    through, rays = observed_medium(tile, kept[0], prepare_in_fit(start, settings, False)), inside(start, tile.rays)
     plain = jax.jit(yardsticks.kept_march)
     dt = step_length(start, settings)
     jax.block_until_ready(plain(through, rays, dt))

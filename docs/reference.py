@@ -20,6 +20,7 @@ PARTS = {
     "effects": "Effects",
     "march": "Marching",
     "rendering": "Pictures",
+    "integrators": "Integrators",
     "fitting": "Fits",
     "io": "Files",
     "others": "Everything else",

@@ -40,6 +40,12 @@ if TYPE_CHECKING:
     from jvr.fitting.losses import SquaredError as SquaredError
     from jvr.fitting.minimisers import LBFGSB as LBFGSB
     from jvr.fitting.residuals import residuals as residuals
+    from jvr.integrators.refinement import Refinement as Refinement
+    from jvr.integrators.slices.oracle import BrickRange as BrickRange
+    from jvr.integrators.slices.oracle import Finest as Finest
+    from jvr.integrators.slices.oracle import LocalError as LocalError
+    from jvr.integrators.slices.oracle import OpacityChange as OpacityChange
+    from jvr.integrators.slices.picture import Slices as Slices
     from jvr.io.exported import use_export as use_export
     from jvr.io.images import read_image as read_image
     from jvr.io.kinds import register as register
@@ -50,10 +56,6 @@ if TYPE_CHECKING:
     from jvr.march.differentiation import Forward as Forward
     from jvr.march.differentiation import Replay as Replay
     from jvr.march.differentiation import Rows as Rows
-    from jvr.march.oracle import BrickRange as BrickRange
-    from jvr.march.oracle import Finest as Finest
-    from jvr.march.oracle import LocalError as LocalError
-    from jvr.march.oracle import OpacityChange as OpacityChange
     from jvr.march.quadrature import Midpoint as Midpoint
     from jvr.march.quadrature import PreIntegrated as PreIntegrated
     from jvr.model import harmonics as harmonics
@@ -115,13 +117,11 @@ if TYPE_CHECKING:
     from jvr.rendering.advise import advise as advise
     from jvr.rendering.image import Rendering as Rendering
     from jvr.rendering.image import RenderStats as RenderStats
-    from jvr.rendering.image import render as render
+    from jvr.rendering.marching import Uniform as Uniform
     from jvr.rendering.measure import Measurement as Measurement
     from jvr.rendering.measure import measure as measure
     from jvr.rendering.plan import plan as plan
-    from jvr.rendering.sampling import Refinement as Refinement
-    from jvr.rendering.sampling import Slices as Slices
-    from jvr.rendering.sampling import Uniform as Uniform
+    from jvr.rendering.render import render as render
     from jvr.rendering.settings import Settings as Settings
     from jvr.rendering.tune import Tuned as Tuned
     from jvr.rendering.tune import tune as tune

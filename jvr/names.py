@@ -1,6 +1,8 @@
 """The public names of `jvr`, by the module that each comes from. Also the only names that a file may call a class by."""
 
+import importlib
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 
@@ -46,6 +48,9 @@ NAMES = {
     "jvr.fitting.minimisers": ("LBFGSB",),
     "jvr.fitting.residuals": ("residuals",),
     "jvr.fitting.bijectors": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
+    "jvr.integrators.refinement": ("Refinement",),
+    "jvr.integrators.slices.oracle": ("BrickRange", "Finest", "LocalError", "OpacityChange"),
+    "jvr.integrators.slices.picture": ("Slices",),
     "jvr.io.exported": ("use_export",),
     "jvr.io.images": ("read_image",),
     "jvr.io.kinds": ("register",),
@@ -53,7 +58,6 @@ NAMES = {
     "jvr.io.scenes": ("load_scene", "save_scene"),
     "jvr.io.volumes": ("read_volume",),
     "jvr.march.differentiation": ("Forward", "Replay", "Rows"),
-    "jvr.march.oracle": ("BrickRange", "Finest", "LocalError", "OpacityChange"),
     "jvr.march.quadrature": ("Midpoint", "PreIntegrated"),
     "jvr.model.brdf": ("BlinnPhongBRDF", "LambertBRDF", "PhaseBRDF", "PhongBRDF"),
     "jvr.model.by_value": ("ByValue",),
@@ -82,11 +86,25 @@ NAMES = {
     "jvr.model.volume": ("Volume",),
     "jvr.pictures": ("linear_from_srgb", "srgb_from_linear", "write_image"),
     "jvr.rendering.advise": ("Advice", "advise"),
-    "jvr.rendering.image": ("RenderStats", "Rendering", "render"),
+    "jvr.rendering.image": ("RenderStats", "Rendering"),
+    "jvr.rendering.marching": ("Uniform",),
     "jvr.rendering.measure": ("Measurement", "measure"),
     "jvr.rendering.plan": ("plan",),
-    "jvr.rendering.sampling": ("Refinement", "Slices", "Uniform"),
+    "jvr.rendering.render": ("render",),
     "jvr.rendering.settings": ("Settings",),
     "jvr.rendering.tune": ("Tuned", "tune"),
     "jvr.types": ("Outcome",),
 }
+
+
+def moved(module: str, names: dict[str, str]) -> Callable[[str], Any]:
+    """The `__getattr__` of a module that had these names, which are elsewhere: for one release they are found there, with a warning."""
+
+    def found(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        warnings.warn(f"{module}.{name} is {names[name]}", DeprecationWarning, stacklevel=2)
+        home, _, new = names[name].rpartition(".")
+        return getattr(importlib.import_module(home), new)
+
+    return found

@@ -2,9 +2,12 @@
 takes the precision of the moment it is built in."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jvr
+from jvr.rendering.medium import medium, prepare
+from jvr.rendering.trace import camera_rays, near_volume, step_length
 
 # One jitted function for all tests: scenes of the same structure share a compiled program.
 render = jax.jit(jvr.render)
@@ -76,3 +79,11 @@ def small() -> jvr.Scene:
     """A volume of floating point through a table, on a coloured background."""
     values = np.random.default_rng(0).random((9, 7, 8)).astype(np.float32)
     return jvr.Scene(jvr.Volume(values), lut_transfer(), background=(0.2, 0.1, 0.3))
+
+
+def marched_rays(scene: jvr.Scene, camera, settings: jvr.Settings):
+    """What the rays of all pixels march through, the rays, and the world length of a segment."""
+    scene, camera = near_volume(scene, camera)
+    prepared = prepare(scene, settings, step_length(scene, settings))
+    rays, _ = camera_rays(scene, camera, jnp.arange(camera.width * camera.height, dtype=jnp.int32))
+    return medium(prepared), rays, prepared.dt

@@ -3,6 +3,7 @@
 import sys
 import types
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -186,14 +187,14 @@ wrap = { positions = [0, 1], values = [0.2, 0.4] }
 [scattering]
 phase = { kind = "linear-cosine", b = 0.6 }
 [settings]
-sampling = "maximum"
+sampling = { kind = "maximum", samples = 5 }
 """
 
 
 def test_they_are_read_from_a_configuration(added, tmp_path):
     (tmp_path / "a.toml").write_text(CONFIG)
     config = read_config(tmp_path / "a.toml")
-    assert build_settings(config) == jvr.Settings(sampling=added.MaximumProjection())
+    assert build_settings(config) == jvr.Settings(sampling=added.MaximumProjection(5))
     found = build_scene(config)
     assert isinstance(found.lights[0], added.PanelLight)
     assert [float(x) for x in (found.lights[0].intensity, found.scattering.phase.b, found.transfer.sigma_t)] == pytest.approx(
@@ -210,21 +211,37 @@ def test_the_integrator_finds_the_largest_scalar(added):
     values = 1.0 - np.einsum("aijk,a->ijk", np.indices((7, 8, 9)), [0.06, 0.03, 0.02])
     grey = jvr.LinearTransfer([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [0, 1])
     look = jvr.OrthographicCamera.look_at([3.0, 3.5, 30.0], [3.0, 3.5, 4.0], [0.0, 1.0, 0.0], 4.0, 4, 4)
-    settings = jvr.Settings(0.02, sampling=added.MaximumProjection())
+    settings = jvr.Settings(sampling=added.MaximumProjection(400))
     picture = render(jvr.Scene(jvr.Volume(values), grey), look, settings)
     centres = (np.arange(4) + 0.5) - 2
     x, y = 3 + centres[None, :], 3.5 - centres[:, None]
-    # The ray ends at z = 0, half a sample behind the last.
-    np.testing.assert_allclose(picture.rgb[..., 0], 1 - 0.06 * x - 0.03 * y, atol=0.02 * 0.02)
+    # The ray ends at z = 0, half a sample, 8 / 800, behind the last.
+    np.testing.assert_allclose(picture.rgb[..., 0], 1 - 0.06 * x - 0.03 * y - 0.02 * 0.01, atol=1e-5)
     np.testing.assert_array_equal(picture.alpha, 1)
+    np.testing.assert_allclose(picture.depth, 30.0 - 8.0, rtol=1e-6)
+    assert int(picture.stats.samples) == 16 * 400
+
+
+BRIGHTNESS = jvr.LinearTransfer([0.0, 0.6, 1.3], [[0.1, 0, 0], [0.4, 0.7, 0.2], [1, 0.8, 0.9]], [0, 0.5, 1])
 
 
 def test_the_integrator_is_differentiable_and_explained(added, x64):
-    settings = jvr.Settings(0.5, sampling=added.MaximumProjection())
-    transfer = jvr.LinearTransfer([0.0, 1.3], [[0, 0, 0], [1, 1, 1]], [0, 1])
-    loss = lambda v: jnp.sum(jvr.render(jvr.Scene(jvr.Volume(v), transfer), camera(), settings).rgb ** 2)
+    settings = jvr.Settings(sampling=added.MaximumProjection(12))
+    loss = lambda v: jnp.sum(jvr.render(jvr.Scene(jvr.Volume(v), BRIGHTNESS), camera(), settings).rgb ** 2)
     v, direction = volume().values, np.random.default_rng(2).normal(size=(7, 8, 9))
     found = jnp.vdot(jax.jit(jax.grad(loss))(v), direction)
     h = 1e-7  # between the changes of which sample is the largest
     assert float(found) == pytest.approx(float(loss(v + h * direction) - loss(v - h * direction)) / (2 * h), rel=1e-5)
-    assert "the largest scalar of each ray" in str(jvr.plan(jvr.Scene(volume(), transfer), settings))
+    assert "the largest of 12 scalars of each ray" in str(jvr.plan(jvr.Scene(volume(), BRIGHTNESS), settings))
+
+
+def test_a_fit_goes_along_the_integrators_rays(added):
+    """Colours of a table are recovered from projections, which a march with them does not look like."""
+    settings, truth = jvr.Settings(sampling=added.MaximumProjection(12)), jvr.Scene(volume(), BRIGHTNESS)
+    cameras = [camera(), camera(-18.0, 10.0, 15.0)]
+    images = [jvr.render(truth, each, settings).rgb for each in cameras]
+    start = eqx.tree_at(lambda s: s.transfer.rgb, truth, jnp.full((3, 3), 0.5))
+    result = jvr.fit(start, cameras, images, unknowns=lambda s: s.transfer.rgb, settings=settings)
+    # No ray has a largest scalar below the second point of the table but those that pass beside the ball.
+    np.testing.assert_allclose(result.scene.transfer.rgb[1:], BRIGHTNESS.rgb[1:], atol=1e-3)
+    assert result.stats.kept_bytes == 0

@@ -1,6 +1,7 @@
 """Who imports whom, what `import jvr` loads, and how often a rendering is traced."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from scenes import OBLIQUE, affine, linear_transfer, lut_transfer, perspective, voxels
 
 import jvr
+from jvr.names import NAMES
 
 PACKAGE = Path(jvr.__file__).parent
 # A module imports from modules before it.
@@ -25,6 +27,7 @@ ORDER = (
     "march",
     "effects",
     "rendering",
+    "integrators",
     "fitting",
     "io",
     "report",
@@ -125,6 +128,49 @@ def test_no_cycles():
 
     for name in graph:
         visit(name)
+
+
+# Where the path of a module of integrators or effects stands: lists of what there is.
+REGISTRY = {"jvr.names", "jvr.io.kinds", "jvr.io.exported"}
+
+
+def test_an_integrators_module_is_named_by_registries_alone():
+    named = {name for path, name in MODULES.items() if "jvr.integrators" in path.read_text(encoding="utf-8")}
+    assert {name for name in named if _part(name) != "integrators"} == REGISTRY
+
+
+def test_an_effects_module_is_named_by_registries_alone():
+    """And by one line, what shows light."""
+    texts = {name: path.read_text(encoding="utf-8") for path, name in MODULES.items() if _part(name) != "effects"}
+    named = {name for name, text in texts.items() if "jvr.effects" in text}
+    assert named - REGISTRY == {"jvr.rendering.medium"}
+    assert texts["jvr.rendering.medium"].count("jvr.effects") == 1
+
+
+def test_what_makes_pictures_and_fits_knows_no_integrator_by_name():
+    """But for the one that is used by default."""
+    homes = [home for home in NAMES if home.startswith(("jvr.integrators.", "jvr.rendering.marching"))]
+    integrators = {name for home in homes for name in NAMES[home]}
+    assert {"Uniform", "Refinement", "Slices", "LocalError"} <= integrators
+    found = set()
+    for path, module in MODULES.items():
+        if _part(module) in ("execution", "model", "march", "effects", "rendering", "fitting"):
+            tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            names = {getattr(node, "id", None) or getattr(node, "attr", None) or getattr(node, "name", None) for node in tree}
+            found |= {(module, name) for name in names & integrators}
+    assert found == {("jvr.rendering.marching", "Uniform"), ("jvr.rendering.settings", "Uniform")}
+
+
+@pytest.mark.parametrize("module", ["jvr.march.oracle", "jvr.rendering.image", "jvr.rendering.sampling"])
+def test_what_has_moved_is_found_where_it_was(module):
+    """For one release, with a warning."""
+    before = importlib.import_module(module)
+    for name, new in before.MOVED.items():
+        home, _, now = new.rpartition(".")
+        with pytest.warns(DeprecationWarning, match=f"{module}.{name} is {new}"):
+            assert getattr(before, name) is getattr(importlib.import_module(home), now)
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        _ = before.nothing
 
 
 def test_import_is_light():

@@ -115,7 +115,7 @@ def _with_transfer_of_its_own(job: FitJob, result: Any, beforehand: Beforehand) 
 
 def _pictures(scene: Any, exposure: float, cameras: Any, job: FitJob) -> list[np.ndarray]:
     """What a scene looks like from each camera, in the radiance of the target images."""
-    from jvr.rendering.image import render
+    from jvr.rendering.render import render
 
     return [exposure * np.asarray(render(scene, camera, job.keywords["settings"]).rgb) for camera in cameras]
 

@@ -46,7 +46,7 @@ def render_pictures(config: Config, output: Path, volume: Volume | None = None, 
 
     from jvr.cli.runtime import compiling
     from jvr.pictures import write_image
-    from jvr.rendering.image import render
+    from jvr.rendering.render import render
 
     pictures, frames, compile_seconds = [], [], 0.0
     if settings.skipping:

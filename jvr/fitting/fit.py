@@ -21,15 +21,16 @@ from jvr.fitting.kinds import march_unknowns
 from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.minimisers import OptimistixSolver
-from jvr.fitting.observations import Observations, check_images, is_mostly_empty, keep_samples, observe
+from jvr.fitting.objective import check_derivatives
+from jvr.fitting.observations import Observations, check_images, check_settings, is_mostly_empty, keep_samples, observe
 from jvr.fitting.problem import Problem
 from jvr.fitting.solvers import AbstractSolver
 from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
-from jvr.rendering.image import render
 from jvr.rendering.measure import similarity
+from jvr.rendering.render import render
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
 
@@ -149,12 +150,13 @@ def fit(
     robust loss its final weights count as the weights. `settings.adjoint` plays no part: each solver has its own.
 
     **Raises** `ValueError` for images that do not fit the cameras, unknowns that are not arrays of the scene, too many unknowns for
-    a least-squares solver, or a loss that the solver cannot use. A non-finite value ends the fit with that outcome and the last good
-    iterate.
+    a least-squares solver, a loss that the solver cannot use, or an integrator whose radiance has no derivative. A non-finite value ends
+    the fit with that outcome and the last good iterate.
     """
     began = time.perf_counter()
     solver = _as_solver(solver)
     targets = check_images(cameras, images)
+    check_settings(settings)
     scene = scene.current()
     model = ExposedModel(scene, jnp.ones(()) if exposure else None)
     chosen = _choose(model, unknowns, transforms, solver)
@@ -162,9 +164,10 @@ def fit(
     scene, chosen = model.scene, _choose(model, unknowns, transforms, solver)
     start = chosen.model_from_unconstrained(model, chosen.unconstrained_from_model(model))
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
-    _check(problem, solver)
+    forwards = _check(problem, solver)
 
     problem, observations = _keep(problem, observe(scene, cameras, targets, weights, settings), keep_samples)
+    check_derivatives(problem, observations, forwards=forwards)
     evaluator = Evaluator(problem, observations, cameras, targets)
     mark = checkpoints.fingerprint(problem, (cameras, targets, weights), solver) if checkpoint else {}
     # The observations hold them.
@@ -241,8 +244,8 @@ def _without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
     return model
 
 
-def _check(problem: Problem, solver: AbstractSolver) -> None:
-    """Combinations that cannot work."""
+def _check(problem: Problem, solver: AbstractSolver) -> bool:
+    """Refuses combinations that cannot work; whether derivatives are taken in forward mode."""
     is_least_squares = isinstance(solver, ChunkedLeastSquares) or (
         isinstance(solver, OptimistixSolver) and isinstance(solver.solver, optx.AbstractLeastSquaresSolver)
     )
@@ -262,6 +265,7 @@ def _check(problem: Problem, solver: AbstractSolver) -> None:
             f"{inner:,} unknowns are too many for a least-squares solver (at most {MOST_FORWARD} beside a table's entries): "
             "use solver=optimistix.LBFGS(rtol=1e-6, atol=1e-8)"
         )
+    return is_least_squares
 
 
 def _keep(problem: Problem, observations: Observations, keep: bool | int) -> tuple[Problem, Observations]:
@@ -269,7 +273,8 @@ def _keep(problem: Problem, observations: Observations, keep: bool | int) -> tup
     among = lambda select: problem.unknowns.among(problem.model, select)
     moving = among(lambda m: (m.scene.volume, m.scene.clipping))
     # What is kept is the scalar alone.
-    if keep is False or moving or problem.model.scene.needs_gradient or isinstance(problem.loss, DSSIM):
+    only_scalars = problem.integrator.marches and not problem.model.scene.needs_gradient
+    if keep is False or moving or not only_scalars or isinstance(problem.loss, DSSIM):
         return problem, observations
     limit = KEEP_LIMIT if keep is True else keep
     # Colours and extinctions of a table leave its ends where they are; whatever else it has may move them.

@@ -42,7 +42,7 @@ def colours_given_extinction(
     unknowns for each channel (the idea of Neuhauser and Westermann 2023, solved over entries instead of voxels). Entries that no ray
     sees keep their colour; colours are clipped to 0 ... 1.
 
-    **Raises** `ValueError` where the transfer function is not a table, or the images do not fit the cameras.
+    **Raises** `ValueError` where the transfer function is not a table, the images do not fit the cameras, or rays are not marched.
     """
     if not isinstance(scene.transfer, AbstractTable):
         raise ValueError(f"colours can be solved for in a table, not in {type(scene.transfer).__name__}")
@@ -51,6 +51,8 @@ def colours_given_extinction(
     unknowns = choose_unknowns(ExposedModel(scene, None), lambda m: colours(m.scene))
     problem = Problem(ExposedModel(scene, None), unknowns, settings, SquaredError(), (), None)
     observations = observe(scene, cameras, targets, None, settings)
+    if not problem.integrator.marches:
+        raise ValueError("radiance is linear in colours along marched rays: leave Settings(sampling=...) at jvr.Uniform()")
     start = jnp.ravel(scene.transfer.rgb)
     matrix, vector = np.zeros((start.size,) * 2), np.zeros(start.size)
     for i in range(observations.tile_count()):

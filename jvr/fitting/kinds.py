@@ -37,7 +37,7 @@ class Kinds(NamedTuple):
     @classmethod
     def of(cls, problem: Problem) -> "Kinds":
         unknowns, model = problem.unknowns, problem.model
-        after, (rgb, sigma_t) = unknowns.among(model, read_after_march), _in_table(problem)
+        after, (rgb, sigma_t) = _after_march(problem), _in_table(problem)
         entries = TableEntries()
         outer, inner, directions = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros((0, 3), int)]
         begin, taken = 0, 0
@@ -87,8 +87,17 @@ def adjoint_of(problem: Problem) -> AbstractAdjoint:
     """How the whole residual vector is differentiated."""
     # Rows do not know light that changes on its way: that of an environment, through a radiance transfer.
     around = lambda m: () if m.scene.radiance_transfer is None else (m.scene.environment, m.scene.radiance_transfer)
-    known = has_table_jacobian(problem.model.scene) and not problem.unknowns.among(problem.model, around)
+    known = _has_rows(problem) and not problem.unknowns.among(problem.model, around)
     return Rows() if known else Forward()
+
+
+def _has_rows(problem: Problem) -> bool:
+    return problem.integrator.marches and has_table_jacobian(problem.model.scene)
+
+
+def _after_march(problem: Problem) -> frozenset[int]:
+    """Which unknowns act on what a march has gathered, and not on the way."""
+    return problem.unknowns.among(problem.model, read_after_march) if problem.integrator.marches else frozenset()
 
 
 def has_table_jacobian(scene: Scene) -> bool:
@@ -100,7 +109,7 @@ def has_table_jacobian(scene: Scene) -> bool:
 
 def _in_table(problem: Problem) -> tuple[frozenset[int], frozenset[int]]:
     """Which unknowns are colours and which extinctions of a table, where their derivatives come by rows."""
-    if not has_table_jacobian(problem.model.scene):
+    if not _has_rows(problem):
         return frozenset(), frozenset()
     columns = (lambda m: m.scene.transfer.rgb), (lambda m: m.scene.transfer.sigma_t)
     rgb, sigma_t = (problem.unknowns.among(problem.model, column) for column in columns)

@@ -11,16 +11,16 @@ from jaxtyping import Array, Float, Int
 
 from jvr.execution.devices import everywhere, over_rays
 from jvr.fitting.kinds import Kinds, TableEntries
-from jvr.fitting.observations import Observations, observed_medium, prepare_in_fit
+from jvr.fitting.objective import seen
+from jvr.fitting.observations import Observations, inside, observed_medium, prepare_in_fit
 from jvr.fitting.problem import Problem, predict, prior
 from jvr.fitting.unknowns import ExposedModel
 from jvr.march.differentiation import Forward
 from jvr.march.jacobian import TableJacobian, table_jacobian
 from jvr.march.march import Marched, MarchOptions
 from jvr.march.medium import Medium
-from jvr.march.steps import Rays
 from jvr.model.scene import Scene
-from jvr.rendering.trace import step_length
+from jvr.rendering.medium import Prepared
 from jvr.types import Triple
 
 
@@ -81,7 +81,7 @@ def _light_tangents(problem: Problem, values: Float[Array, "unknowns"]) -> Light
 
     def around(part: Array) -> tuple[Any, Any]:
         prepared = prepare_in_fit(kinds.changed(part, values).scene, problem.settings, problem.skips)
-        return eqx.partition(prepared.shadows, eqx.is_inexact_array)
+        return eqx.partition(prepared.visibility, eqx.is_inexact_array)
 
     part = values[kinds.inner]
     if not part.size:
@@ -169,41 +169,42 @@ def _jacobian(
     blocks: list[Blocks] = [[], [], []]
     arrays, rest, tangents = around or LightTangents(None, None, None)
 
-    def observed(scene: Scene, arrays: Any) -> tuple[Medium, Rays]:
+    def observed(scene: Scene, arrays: Any) -> tuple[Prepared, Medium | None]:
         visible = None if around is None else eqx.combine(arrays, rest)
         prepared = prepare_in_fit(scene, problem.settings, problem.skips, visible)
-        return observed_medium(scene, tile, problem.samples, problem.settings, prepared)
+        return prepared, observed_medium(tile, problem.samples, prepared) if problem.integrator.marches else None
 
-    def of_inner(part: Array, arrays: Any) -> tuple[Triple, Marched]:
+    def look(part: Array, arrays: Any) -> tuple[Triple, Marched | None]:
         changed = kinds.changed(part, values)
-        medium, rays = observed(changed.scene, arrays)
-        gathered = Forward().march(options, medium, rays, step_length(changed.scene, problem.settings))
-        return predict(problem, changed, gathered, rays.length), gathered
+        prepared, through = observed(changed.scene, arrays)
+        return seen(problem, changed, inside(changed.scene, tile.rays), through, prepared, Forward())
 
-    medium, rays = observed(model.scene, arrays)
-    gathered = None
+    rays, gathered, colours = inside(model.scene, tile.rays), None, ()
     if any(indices is not None for indices in kinds.entries):
-        dt, of_extinctions = step_length(model.scene, problem.settings), kinds.entries.sigma_t is not None
-        gathered, rows = table_jacobian(options, medium, rays, dt, of_extinctions=of_extinctions)
-        _add_entries(problem, model, gathered, rows, rays.length, kinds.entries, blocks)
+        prepared, through = observed(model.scene, arrays)
+        assert through is not None
+        of_extinctions = kinds.entries.sigma_t is not None
+        gathered, rows = table_jacobian(options, through, rays, prepared.dt, of_extinctions=of_extinctions)
+        _add_entries(model, gathered, rows, rays.length, kinds.entries, blocks)
     if kinds.inner.size:
         point = (values[kinds.inner], arrays)
-        along = jax.vmap(lambda *t: jax.jvp(of_inner, point, t, has_aux=True), out_axes=(None, 0, None))
-        _, jacobian, gathered = along(kinds.basis(values.dtype), tangents)
+        along = jax.vmap(lambda *t: jax.jvp(look, point, t, has_aux=True), out_axes=(None, 0, None))
+        colours, jacobian, gathered = along(kinds.basis(values.dtype), tangents)
         for c in range(3):
             blocks[c].append((jacobian[c].T, kinds.inner[kinds.directions[:, c]]))
+    if gathered is None and not colours:
+        colours, gathered = look(values[kinds.inner], arrays)
     if gathered is None:
-        gathered = Forward().march(options, medium, rays, step_length(model.scene, problem.settings))
+        return colours, blocks
     if kinds.outer.size:
-        after = lambda part: predict(problem, kinds.changed(part, values, kinds.outer), gathered, rays.length)
+        after = lambda part: predict(kinds.changed(part, values, kinds.outer), gathered, rays.length)
         of_outer = jax.jacfwd(after)(values[kinds.outer])
         for c in range(3):
             blocks[c].append((of_outer[c], kinds.outer))
-    return predict(problem, model, gathered, rays.length), blocks
+    return predict(model, gathered, rays.length), blocks
 
 
 def _add_entries(
-    problem: Problem,
     model: ExposedModel,
     gathered: Marched,
     rows: TableJacobian,
@@ -214,7 +215,7 @@ def _add_entries(
     """Chains the rows of the march with what happens to radiance and optical depth after it, channel by channel."""
     ones = jax.tree.map(jnp.ones_like, (gathered.radiance, gathered.tau))
     zeros = jax.tree.map(jnp.zeros_like, ones)
-    final = lambda radiance, tau: predict(problem, model, gathered._replace(radiance=radiance, tau=tau), length)
+    final = lambda radiance, tau: predict(model, gathered._replace(radiance=radiance, tau=tau), length)
     _, by_radiance = jax.jvp(final, (gathered.radiance, gathered.tau), (ones[0], zeros[1]))
     _, by_tau = jax.jvp(final, (gathered.radiance, gathered.tau), (zeros[0], ones[1]))
     sigma_t = entries.sigma_t

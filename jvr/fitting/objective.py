@@ -13,14 +13,16 @@ from jaxtyping import Array, Float, Int
 from jvr.execution.devices import everywhere, over_rays, shares
 from jvr.execution.tiles import dealt_blocks, picture_of, pixels_of
 from jvr.fitting.kinds import adjoint_of
-from jvr.fitting.observations import Observations, observed_medium, prepare_in_fit
-from jvr.fitting.problem import Problem, predict, prior
+from jvr.fitting.observations import Observations, inside, observed_medium, prepare_in_fit
+from jvr.fitting.problem import Problem, exposed, predict, prior
 from jvr.fitting.unknowns import ExposedModel
 from jvr.march.differentiation import AbstractAdjoint, Replay
-from jvr.march.march import MarchOptions
+from jvr.march.march import Marched, MarchOptions
+from jvr.march.medium import Medium
+from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
-from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Prepared, step_length, trace
+from jvr.rendering.medium import Prepared, medium
+from jvr.rendering.trace import camera_rays, near_volume
 from jvr.types import Image, Scalar, Triple
 
 
@@ -69,11 +71,40 @@ def residual(
     problem: Problem, model: ExposedModel, tile: Observations, prepared: Prepared, adjoint: AbstractAdjoint = Replay()
 ) -> Triple:
     """Rendered minus target in each channel, differentiable in the mode of `adjoint`."""
-    medium, rays = observed_medium(model.scene, tile, problem.samples, problem.settings, prepared)
-    options = MarchOptions(problem.settings.termination, distance=False)
-    gathered = adjoint.march(options, medium, rays, step_length(model.scene, problem.settings))
-    colours = predict(problem, model, gathered, rays.length)
+    through = observed_medium(tile, problem.samples, prepared) if problem.integrator.marches else None
+    colours, _ = seen(problem, model, inside(model.scene, tile.rays), through, prepared, adjoint)
     return tuple(c - tile.target[:, i] for i, c in enumerate(colours))
+
+
+def seen(
+    problem: Problem, model: ExposedModel, rays: Rays, medium: Medium | None, prepared: Prepared, adjoint: AbstractAdjoint
+) -> tuple[Triple, Marched | None]:
+    """Colours of rays as the targets have them, and what a march through `medium` gathered for that, where the integrator is one."""
+    if medium is None:
+        prepared = prepared._replace(settings=eqx.tree_at(lambda s: s.adjoint, prepared.settings, adjoint))
+        rgb = problem.integrator.radiance(prepared, rays).rgb
+        return exposed(model, (rgb[:, 0], rgb[:, 1], rgb[:, 2])), None
+    gathered = adjoint.march(MarchOptions(problem.settings.termination, distance=False), medium, rays, prepared.dt)
+    return predict(model, gathered, rays.length), gathered
+
+
+def check_derivatives(problem: Problem, tiles: Observations, *, forwards: bool) -> None:
+    """**Raises** `ValueError` where the radiance of an integrator has no derivative in the mode that a solver takes it in."""
+    if problem.integrator.marches:
+        return
+    # Whatever the loss: it is the radiance that may have none.
+    problem, total = problem.least_squares(), jnp.ones(())
+    unconstrained = problem.unknowns.unconstrained_from_model(problem.model)
+    function = lambda x: residuals(problem, x, tiles, total) if forwards else value(problem, x, tiles, total)
+    jax.eval_shape(function, unconstrained)
+    differentiated = (lambda x: jax.jvp(function, (x,), (x,))) if forwards else jax.grad(function)
+    try:
+        jax.eval_shape(differentiated, unconstrained)
+    # Whatever JAX says of what it cannot differentiate: what is wrong with the function itself has been raised before.
+    except Exception as error:
+        name, mode = type(problem.integrator).__name__, "forward" if forwards else "reverse"
+        reason = str(error).strip().splitlines()[0]
+        raise ValueError(f"a fit takes derivatives of {name} in {mode} mode, which has none: {reason}") from error
 
 
 @eqx.filter_jit
@@ -82,15 +113,14 @@ def image_value(
 ) -> Scalar:
     """`value` for a loss over whole images: the mean over images plus priors."""
     model = problem.unknowns.model_from_unconstrained(problem.model, unconstrained)
-    settings = eqx.tree_at(lambda s: s.adjoint, problem.settings, Replay())
-    losses, prepared = [], prepare_in_fit(model.scene, settings, problem.skips)
+    losses, prepared = [], prepare_in_fit(model.scene, problem.settings, problem.skips)
     for camera, target in zip(cameras, images, strict=True):
-        rendered = _rendered(problem, model, camera, settings, prepared)
+        rendered = _rendered(problem, model, camera, prepared)
         losses.append(problem.loss.image(rendered, target))
     return jnp.mean(jnp.stack(losses)) + prior(problem, model)
 
 
-def _rendered(problem: Problem, model: ExposedModel, camera: AbstractCamera, settings: Settings, prepared: Prepared) -> Image:
+def _rendered(problem: Problem, model: ExposedModel, camera: AbstractCamera, prepared: Prepared) -> Image:
     """A whole image, colours as the targets have them."""
     height, width = camera.height, camera.width
 
@@ -98,8 +128,10 @@ def _rendered(problem: Problem, model: ExposedModel, camera: AbstractCamera, set
         shared: tuple[Problem, ExposedModel, AbstractCamera, Prepared], blocks: Int[Array, "blocks"]
     ) -> Float[Array, "rays 3"]:
         problem, model, camera, prepared = shared
-        gathered, rays, _ = trace(model.scene, camera, settings, pixels_of(blocks, height, width), prepared=prepared)
-        return jnp.stack(predict(problem, model, gathered, rays.length), axis=-1)
+        _, near = near_volume(model.scene, camera)
+        rays, _ = camera_rays(prepared.scene, near, pixels_of(blocks, height, width))
+        through = medium(prepared) if problem.integrator.marches else None
+        return jnp.stack(seen(problem, model, rays, through, prepared, Replay())[0], axis=-1)
 
     shared = (problem.apart()[0], model, camera, prepared)
     rays = everywhere(over_rays(share, shared, dealt_blocks(height, width, shares())))

@@ -22,10 +22,10 @@ from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
 from jvr.numerics import two_sum
 from jvr.pictures import as_radiance
-from jvr.rendering.medium import environment, medium, occupancy, visibility
-from jvr.rendering.sampling import Uniform
+from jvr.rendering.integrator import AbstractRayIntegrator
+from jvr.rendering.medium import Prepared, medium, occupancy, prepare
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Prepared, ahead, enter, near_volume, step_length
+from jvr.rendering.trace import ahead, enter, near_volume, step_length
 from jvr.types import Scalar, Triple
 
 # Rays whose rows are held at a time; smaller batches lose the second core, larger ones fall out of the cache.
@@ -133,6 +133,17 @@ def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "ta
     return images
 
 
+def check_settings(settings: Settings) -> None:
+    """**Raises** `ValueError` for settings that fits do not support."""
+    integrator, remedy = settings.sampling, "leave Settings(sampling=...) at jvr.Uniform()"
+    if not isinstance(integrator, AbstractRayIntegrator):
+        raise ValueError(f"a fit takes every sample of every ray: {remedy}")
+    if not integrator.is_differentiable:
+        raise ValueError(f"a fit goes by derivatives, and {type(integrator).__name__} has none: {remedy}")
+    if integrator.marches and not isinstance(settings.quadrature, Midpoint):
+        raise ValueError("a fit resamples the midpoints of segments: leave Settings(quadrature=...) at jvr.Midpoint()")
+
+
 def observe(
     scene: Scene,
     cameras: Sequence[AbstractCamera],
@@ -146,14 +157,11 @@ def observe(
 
     **Raises** `ValueError` for settings that fits do not support.
     """
-    if not isinstance(settings.quadrature, Midpoint):
-        raise ValueError("a fit resamples the midpoints of segments: leave Settings(quadrature=...) at jvr.Midpoint()")
-    if not isinstance(settings.sampling, Uniform):
-        raise ValueError("a fit takes every sample of every ray: leave Settings(sampling=...) at jvr.Uniform()")
+    check_settings(settings)
     weights = _check_weights(cameras, weights, images[0].dtype)
     # Compiled for all cameras of one size and kind.
     rays = [_rays(scene, camera) for camera in cameras]
-    length = np.concatenate([np.asarray(_inside(scene, one).length) for one in rays])
+    length = np.concatenate([np.asarray(inside(scene, one).length) for one in rays])
     order = np.argsort(-length, kind="stable").astype(np.int32)
     chunk = min(chunk or CHUNK, -(-order.size // shares()))
     together = chunk * shares()
@@ -182,7 +190,7 @@ def _rays(scene: Scene, camera: AbstractCamera) -> WorldRays:
 
 
 @jax.jit
-def _inside(scene: Scene, rays: WorldRays) -> Rays:
+def inside(scene: Scene, rays: WorldRays) -> Rays:
     """The rays inside of the volume, wherever that is in the world."""
     zero = jax.lax.stop_gradient(scene.volume.origin)
     (scene,) = near_volume(scene)
@@ -233,8 +241,7 @@ def prepare_in_fit(scene: Scene, settings: Settings, skips: bool, visible: Abstr
     """What is computed once for all rays; `skips`: whether rays skip empty bricks although nothing else is negligible; `visible`: how
     much light reaches a point, where that is known."""
     (scene,) = near_volume(scene)
-    occupied = occupancy(scene, settings) if settings.negligible or skips else None
-    return Prepared(occupied, visibility(scene, occupied) if visible is None else visible, environment(scene))
+    return prepare(scene, settings, step_length(scene, settings), skips=bool(settings.negligible) or skips, visible=visible)
 
 
 def is_mostly_empty(scene: Scene, settings: Settings) -> bool:
@@ -243,15 +250,10 @@ def is_mostly_empty(scene: Scene, settings: Settings) -> bool:
     return occupied is not None and float(jnp.mean(occupied.empty_radius > 0)) >= 0.5
 
 
-def observed_medium(
-    scene: Scene, tile: Observations, samples: Samples | None, settings: Settings, prepared: Prepared
-) -> tuple[Medium, Rays]:
-    """What the rays of a tile march through, resampled anew or from kept samples, and the rays inside of it."""
-    rays = _inside(scene, tile.rays)
-    through = medium(near_volume(scene)[0], settings, prepared)
-    if samples is not None:
-        through = through._replace(field=samples.along(tile.start))
-    return through, rays
+def observed_medium(tile: Observations, samples: Samples | None, prepared: Prepared) -> Medium:
+    """What the rays of a tile march through, resampled anew or from kept samples."""
+    through = medium(prepared)
+    return through if samples is None else through._replace(field=samples.along(tile.start))
 
 
 @jax.jit
@@ -260,7 +262,7 @@ def _segments(scene: Scene, observations: Observations, dt: Scalar) -> Int[Array
 
     def share(shared: tuple[Scene, Scalar], observations: Observations) -> Int[Array, "tiles"]:
         scene, dt = shared
-        return jax.vmap(lambda rays: jnp.max(segment_count(_inside(scene, rays).length, dt)))(observations.rays)
+        return jax.vmap(lambda rays: jnp.max(segment_count(inside(scene, rays).length, dt)))(observations.rays)
 
     return everywhere(over_rays(share, (scene, dt), observations))
 
@@ -280,7 +282,7 @@ def _resample(
     def share(shared: Any, own: tuple[Array, Observations]) -> Array:
         scene, (index, begin, count), dt, low, scale = shared
         stored, observations = own
-        rays = _inside(scene, observations.tile(index).rays)
+        rays = inside(scene, observations.tile(index).rays)
 
         def one(k: Int[Array, ""], stored: Array) -> Array:
             _, u = segment_span(k, segment_count(rays.length, dt), rays.length, dt)

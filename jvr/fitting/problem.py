@@ -9,6 +9,7 @@ from jvr.fitting.losses import AbstractPrior, SquaredError
 from jvr.fitting.observations import Samples
 from jvr.fitting.unknowns import ExposedModel, Unknowns
 from jvr.march.march import Marched
+from jvr.rendering.integrator import AbstractRayIntegrator
 from jvr.rendering.settings import Settings
 from jvr.rendering.trace import composite
 from jvr.types import Scalar, Triple
@@ -24,6 +25,12 @@ class Problem(eqx.Module):
     priors: tuple[AbstractPrior, ...]
     samples: Samples | None
     skips: bool = eqx.field(static=True, default=False)  # empty bricks, in what has no derivative there
+
+    @property
+    def integrator(self) -> AbstractRayIntegrator:
+        """What finds the radiance of its rays."""
+        assert isinstance(self.settings.sampling, AbstractRayIntegrator)
+        return self.settings.sampling
 
     def with_samples(self, samples: Samples) -> "Problem":
         return Problem(self.model, self.unknowns, self.settings, self.loss, self.priors, samples, self.skips)
@@ -46,9 +53,13 @@ class Problem(eqx.Module):
         return Problem(self.model, self.unknowns, self.settings, SquaredError(), (), self.samples, self.skips)
 
 
-def predict(problem: Problem, model: ExposedModel, gathered: Marched, length: Float[Array, "rays"]) -> Triple:
+def predict(model: ExposedModel, gathered: Marched, length: Float[Array, "rays"]) -> Triple:
     """Colours as the target images have them."""
-    rgb, _ = composite(model.scene, gathered, length)
+    return exposed(model, composite(model.scene, gathered, length)[0])
+
+
+def exposed(model: ExposedModel, rgb: Triple) -> Triple:
+    """Radiance as the target images have it."""
     return rgb if model.exposure is None else tuple(model.exposure * c for c in rgb)
 
 

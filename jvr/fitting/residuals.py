@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jvr.fitting.observations import check_images
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.rendering.image import render
+from jvr.rendering.render import render
 from jvr.rendering.settings import Settings
 
 

@@ -12,7 +12,7 @@ import jax
 from jax import export
 
 # Where the types are that such a function may take or return.
-PACKAGES = ("jvr.model", "jvr.march", "jvr.effects", "jvr.rendering")
+PACKAGES = ("jvr.model", "jvr.march", "jvr.effects", "jvr.rendering", "jvr.integrators")
 
 
 class _Empty(eqx.Module):

@@ -7,8 +7,8 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
+from jvr.integrators.slices.oracle import AbstractOracle
 from jvr.march.differentiation import AbstractAdjoint
-from jvr.march.oracle import AbstractOracle
 from jvr.march.quadrature import AbstractQuadrature
 from jvr.model.camera import AbstractCamera
 from jvr.model.effects import (
@@ -27,7 +27,7 @@ from jvr.model.optical import AbstractOpticalModel
 from jvr.model.phase import AbstractPhase
 from jvr.model.transfer import AbstractTransfer
 from jvr.names import NAMES
-from jvr.rendering.sampling import AbstractSampling
+from jvr.rendering.integrator import AbstractIntegrator
 
 HOMES = {name: module for module, names in NAMES.items() for name in names}
 # Public classes that a scene is made of, by name: the module that is imported when a file names one, or a class that was registered.
@@ -104,7 +104,7 @@ KINDS: dict[type, dict[str, str]] = {
     },
     AbstractQuadrature: {"midpoint": "Midpoint", "pre-integrated": "PreIntegrated"},
     AbstractAdjoint: {"replay": "Replay", "forward": "Forward", "rows": "Rows"},
-    AbstractSampling: {"uniform": "Uniform", "slices": "Slices", "refinement": "Refinement"},
+    AbstractIntegrator: {"uniform": "Uniform", "slices": "Slices", "refinement": "Refinement"},
     AbstractOracle: {
         "local-error": "LocalError",
         "opacity-change": "OpacityChange",

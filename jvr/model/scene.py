@@ -102,6 +102,11 @@ class Scene(AbstractPart):
         return self.shows_lights or any(part.shows_environment for _, part in parts_of(self))
 
     @property
+    def shadow_casters(self) -> tuple[AbstractLight | None, ...]:
+        """Its lights, `None` in the place of each that nothing shades."""
+        return _casters(self.lights)
+
+    @property
     def needs_gradient(self) -> bool:
         return any(part.needs_gradient for _, part in parts_of(self))
 
@@ -116,7 +121,7 @@ class Scene(AbstractPart):
         """The scene with other parts, and without what these cannot carry: shadows go with the last light that casts them and the last part
         that shows them, the material and the radiance transfer with the environment."""
         light, shading, scattering = (parts.get(name, getattr(self, name)) for name in ("lights", "shading", "scattering"))
-        if not any(isinstance(x, AbstractLight) and x.casts_shadows for x in light) or (shading is None and scattering is None):
+        if not any(_casters(light)) or (shading is None and scattering is None):
             parts["shadows"] = None
         if parts.get("environment", self.environment) is None:
             parts |= {"environment": None, "material": None, "radiance_transfer": None}
@@ -136,9 +141,13 @@ def material_order(environment: EnvironmentLight, transfer: AbstractRadianceTran
     return max(environment.order, transfer.order)
 
 
+def _casters(lights: Sequence[AbstractEmitter]) -> tuple[AbstractLight | None, ...]:
+    return tuple(light if isinstance(light, AbstractLight) and light.casts_shadows else None for light in lights)
+
+
 def _check_light(scene: Scene) -> None:
     """Parts of the light that go together."""
-    if scene.shadows is not None and not any(isinstance(light, AbstractLight) and light.casts_shadows for light in scene.lights):
+    if scene.shadows is not None and not any(scene.shadow_casters):
         raise ValueError(
             "there are shadows and no light that casts them: add a jvr.DirectionalLight to lights=, or leave shadows out"
         )

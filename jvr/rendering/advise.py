@@ -12,7 +12,7 @@ import numpy as np
 from jvr.model.camera import AbstractCamera
 from jvr.model.parts import AbstractPart, parts_of, spelling, with_part
 from jvr.model.scene import Scene
-from jvr.rendering.image import render
+from jvr.rendering.render import render
 from jvr.rendering.settings import Settings
 
 Variant = tuple[Scene, Settings]

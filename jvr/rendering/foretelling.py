@@ -7,6 +7,7 @@ grows with its pixels and with what each knob makes of it.
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 import time
@@ -21,8 +22,9 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.parts import Knob, parts_of, with_part
 from jvr.model.scene import Scene
 from jvr.rendering.measure import Measurement, TimedPicture, compared, reference, timed_pictures
+from jvr.rendering.medium import prepare
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import prepare
+from jvr.rendering.trace import near_volume, step_length
 
 # Pictures are this much smaller on each side.
 SMALLER = 2
@@ -155,7 +157,11 @@ def _that_go(variant: Variant, turns: Sequence[Turn], crossed: Sequence[Turn]) -
     return found
 
 
-_prepare = jax.jit(prepare, static_argnums=1)
+@functools.partial(jax.jit, static_argnums=1)
+def _prepare(scene: Scene, settings: Settings) -> Any:
+    (scene,) = near_volume(scene)
+    prepared = prepare(scene, settings, step_length(scene, settings))
+    return prepared.occupancy, prepared.visibility, prepared.lighting
 
 
 def _prepared(variants: Sequence[Variant]) -> list[float]:

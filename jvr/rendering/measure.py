@@ -15,7 +15,7 @@ from jaxtyping import Array
 from jvr.march.differentiation import Replay
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.rendering.image import render
+from jvr.rendering.render import render
 from jvr.rendering.settings import FINER, Settings
 
 

@@ -7,7 +7,8 @@ from jvr.march.quadrature import AbstractQuadrature, Midpoint, PreIntegrated
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import AbstractPart, Knob, PlanEntry
 from jvr.model.ranges import AT_LEAST_ONE, POSITIVE, TRANSMITTANCE
-from jvr.rendering.sampling import AbstractSampling, Uniform
+from jvr.rendering.integrator import AbstractIntegrator
+from jvr.rendering.marching import Uniform
 
 # Values of its knobs, the coarsest first.
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
@@ -45,7 +46,7 @@ class Settings(AbstractPart):
     skipping: bool = choice(doc="whether empty bricks are skipped")
     negligible: float = choice(TRANSMITTANCE, doc="optical depth that a ray may leave out", hint="1e-3 changes no 8-bit picture")
     adjoint: AbstractAdjoint = parameter(doc="jvr.Replay(), jvr.Forward() or jvr.Rows()")
-    sampling: AbstractSampling = parameter(doc="jvr.Uniform(), jvr.Refinement() or jvr.Slices()")
+    sampling: AbstractIntegrator = parameter(doc="jvr.Uniform(), jvr.Refinement() or jvr.Slices()")
     tile: int = choice(AT_LEAST_ONE, doc="rays at a time")
 
     def __init__(
@@ -57,7 +58,7 @@ class Settings(AbstractPart):
         skipping: bool = True,
         negligible: float | int = 0.0,
         adjoint: AbstractAdjoint = Replay(),
-        sampling: AbstractSampling = Uniform(),
+        sampling: AbstractIntegrator = Uniform(),
         tile: int = 262_144,
     ):
         assign(self, step=step, termination=termination, quadrature=quadrature, skipping=skipping)

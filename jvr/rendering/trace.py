@@ -1,68 +1,26 @@
-"""Camera rays: from the camera into the volume, through it, and what they have gathered as colours."""
+"""Rays in the world: from a camera into the volume, and what they have gathered there as colours."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.march.march import Marched, MarchOptions
-from jvr.march.medium import Medium
+from jvr.march.march import Marched
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
-from jvr.numerics import divide_or_zero, larger, one_minus_exp, ray_box, smaller
-from jvr.rendering.medium import Prepared, environment, medium, occupancy, visibility
-from jvr.rendering.settings import Settings
+from jvr.numerics import larger, one_minus_exp, ray_box, smaller
 from jvr.types import Scalar, Triple
+
+if TYPE_CHECKING:
+    # Settings hold an integrator, which traces rays.
+    from jvr.rendering.settings import Settings
 
 # How many radii of the volume a camera is away from its middle for its rays to start there.
 FAR = 2.0
-
-
-def prepare(scene: Scene, settings: Settings, step: Scalar | float | None = None) -> Prepared:
-    """What rays through a scene need to know beforehand, computed once. `step`: in place of that of the settings; traced, one
-    program serves all steps."""
-    (scene,) = near_volume(scene)
-    occupied = occupancy(scene, settings)
-    dt = None if step is None else step * jnp.min(scene.volume.spacing)
-    return Prepared(occupied, visibility(scene, occupied), environment(scene), dt)
-
-
-def trace(
-    scene: Scene,
-    camera: AbstractCamera,
-    settings: Settings,
-    pixels: Int[Array, "rays"],
-    *,
-    prepared: Prepared = Prepared(),
-    distance: bool = False,
-) -> tuple[Marched, Rays, Float[Array, "rays"]]:
-    """Marches the rays of some pixels, only where `prepared` leaves something to see; returns what they gathered, the rays, and the
-    distance from the eye to their entry."""
-    of_camera, t_in = camera_rays(scene, camera, settings, pixels, prepared)
-    return settings.adjoint.march(MarchOptions(settings.termination, distance), *of_camera), of_camera.rays, t_in
-
-
-class CameraRays(NamedTuple):
-    """What a march takes: what rays go through, the rays, and the length of a segment."""
-
-    medium: Medium
-    rays: Rays
-    dt: Scalar
-
-
-def camera_rays(
-    scene: Scene, camera: AbstractCamera, settings: Settings, pixels: Int[Array, "rays"], prepared: Prepared
-) -> tuple[CameraRays, Float[Array, "rays"]]:
-    """The rays of some pixels before they are marched, and the distance from the eye to their entry."""
-    scene, camera = near_volume(scene, camera)
-    rays, t_in = enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)))
-    return CameraRays(
-        medium(scene, settings, prepared), rays, step_length(scene, settings) if prepared.dt is None else prepared.dt
-    ), t_in
 
 
 def promote_dtypes(scene: Scene, *others: Any) -> Any:
@@ -96,7 +54,7 @@ def ahead(scene: Scene, camera: AbstractCamera) -> Scalar:
     return jax.lax.stop_gradient(jnp.where(depth > FAR * scene.volume.radius, depth, 0.0))
 
 
-def step_length(scene: Scene, settings: Settings) -> Scalar:
+def step_length(scene: Scene, settings: "Settings") -> Scalar:
     """World length of a segment."""
     return settings.step * jnp.min(scene.volume.spacing)
 
@@ -126,6 +84,11 @@ def enter(
     return Rays(entry, along, t_out - t_in + poison), jnp.where(hit, behind + t_in, 0.0)
 
 
+def camera_rays(scene: Scene, camera: AbstractCamera, pixels: Int[Array, "rays"]) -> tuple[Rays, Float[Array, "rays"]]:
+    """The rays of some pixels inside the volume, and the distance from the eye to where they enter; scene and camera near the volume."""
+    return enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)))
+
+
 def composite(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> tuple[Triple, Float[Array, "rays"]]:
     """Colour of each ray with the background behind the medium, and the medium's opacity."""
     transmittances = tuple(jnp.exp(-tau) for tau in gathered.tau)
@@ -137,19 +100,3 @@ def composite(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> 
     # Not 1 - T: thin media keep their digits.
     alpha = sum((one_minus_exp(tau) for tau in gathered.tau), zero) / max(len(gathered.tau), 1)
     return rgb, alpha
-
-
-class Pixels(NamedTuple):
-    """What a `jvr.Rendering` shows of each ray."""
-
-    rgb: Float[Array, "rays 3"]
-    alpha: Float[Array, "rays"]
-    depth: Float[Array, "rays"]
-
-
-def resolve(scene: Scene, gathered: Marched, rays: Rays, t_in: Float[Array, "rays"]) -> Pixels:
-    """The pixels of rays that were marched with their distance."""
-    rgb, alpha = composite(scene, gathered, rays.length)
-    weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
-    depth = jnp.where(alpha > 0, t_in + divide_or_zero(weighted, alpha), 0.0)
-    return Pixels(jnp.stack(rgb, axis=-1), alpha, depth)

@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import OBLIQUE, gaussian_transfer, linear_transfer, lut_transfer, perspective, voxels
+from scenes import OBLIQUE, gaussian_transfer, linear_transfer, lut_transfer, marched_rays, perspective, voxels
 
 import jvr
-from jvr.rendering.trace import trace
+from jvr.march.march import MarchOptions
 
 WIDTH, HEIGHT = 5, 4
 
@@ -182,16 +182,16 @@ def test_rows_of_a_table(kind, termination, x64):
     p = parameters(TRANSFERS[kind]())
     volume = jvr.Volume(p["voxels"], p["world_from_grid"])
     camera = jvr.PerspectiveCamera.look_at(p["eye"], p["target"], p["up"], p["extent"], WIDTH, HEIGHT)
-    pixels = jnp.arange(WIDTH * HEIGHT)
 
     def gathered(adjoint):
-        settings = jvr.Settings(0.7, termination=termination, adjoint=adjoint)
+        settings = jvr.Settings(0.7, skipping=False)
 
         def of(entries):
             transfer = jax.tree.map(lambda x: x, p["transfer"])
             object.__setattr__(transfer, "rgb", entries["rgb"])
             object.__setattr__(transfer, "sigma_t", entries["sigma_t"])
-            marched = trace(jvr.Scene(volume, transfer), camera, settings, pixels, distance=False)[0]
+            rays = marched_rays(jvr.Scene(volume, transfer), camera, settings)
+            marched = adjoint.march(MarchOptions(termination, distance=False), *rays)
             return {"radiance": marched.radiance, "tau": marched.tau}
 
         return of

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import OBLIQUE, perspective
+from scenes import OBLIQUE, marched_rays, perspective
 
 import jvr
 from jvr.march.jacobian import table_jacobian
 from jvr.march.march import MarchOptions
 from jvr.march.occupancy import RADII, occupancy_of
 from jvr.model.bricks import bricks_of
-from jvr.rendering.trace import camera_rays, prepare
 
 SHAPES = [(9, 9, 9), (13, 6, 17), (1, 12, 10), (2, 3, 5), (1, 1, 1)]
 
@@ -214,8 +213,7 @@ def test_the_jacobian_is_the_same(x64):
 
     def rows(skipping, of_extinctions):
         choices = jvr.Settings(0.6, skipping=skipping)
-        of_camera, _ = camera_rays(scene, camera, choices, jnp.arange(30, dtype=jnp.int32), prepare(scene, choices))
-        return table_jacobian(MarchOptions(0.0, False), *of_camera, of_extinctions=of_extinctions)[1]
+        return table_jacobian(MarchOptions(0.0, False), *marched_rays(scene, camera, choices), of_extinctions=of_extinctions)[1]
 
     exact, everything, colours = (jax.jit(lambda o=o: rows(*o))() for o in ((False, True), (True, True), (True, False)))
     compare = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)

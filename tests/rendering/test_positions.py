@@ -10,7 +10,7 @@ import pytest
 from scenes import affine, linear_transfer, render
 
 import jvr
-from jvr.fitting.observations import observe, observed_medium, prepare_in_fit
+from jvr.fitting.observations import inside, observe
 
 SETTINGS = jvr.Settings(0.6, termination=0)
 UTM = (759186.3, -2957195.7, 1203.1)
@@ -118,14 +118,13 @@ def test_what_single_precision_has_left_goes_with_the_number_it_belongs_to():
 def test_rays_of_a_fit_keep_their_digits():
     """Entry, direction and length inside of a volume at UTM, seen from afar, as at the origin of the world."""
 
-    def inside(origin):
+    def rays(origin):
         scene, camera = build(origin, 1e4, "perspective")
         images = [np.zeros((camera.height, camera.width, 3), np.float32)]
         observations = observe(scene, [camera], images, None, SETTINGS)
-        prepared = prepare_in_fit(scene, SETTINGS, skips=False)
-        return observed_medium(scene, observations.tile(0), None, SETTINGS, prepared)[1]
+        return inside(scene, observations.tile(0).rays)
 
-    there, here = inside(UTM), inside((0.0, 0, 0))
+    there, here = rays(UTM), rays((0.0, 0, 0))
     for a, b in zip(jax.tree.leaves(there), jax.tree.leaves(here), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-5)
     assert np.asarray(here.length).max() > 5

@@ -23,7 +23,7 @@ from jvr.model.camera import AbstractCamera, PerspectiveCamera, fibonacci_sphere
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTransfer, LutTransfer
 from jvr.model.volume import Volume
-from jvr.rendering.image import render
+from jvr.rendering.render import render
 from jvr.rendering.settings import Settings
 
 READ_KEYWORDS = ("shape", "dtype", "spacing", "origin", "direction", "slope", "intercept")

@@ -12,13 +12,14 @@ from jvr.io.config.schema.light import Lights, Normals, Scattering, Shading, Sha
 from jvr.io.config.schema.parts import BASES, KindTable, only, part
 from jvr.io.config.schema.table import Colour, Extinction, Position, Range, Scalar, Table, one_or_more
 from jvr.io.config.schema.transfer import Transfer
+from jvr.io.kinds import maker_of
 from jvr.model.camera import AbstractCamera
 from jvr.model.clipping import ClippingBox
 from jvr.model.interpolation import AbstractInterpolation
 from jvr.model.optical import AbstractOpticalModel
 from jvr.model.parameters import declared
 from jvr.model.ranges import AT_LEAST_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL, Interval
-from jvr.rendering.sampling import AbstractSampling
+from jvr.rendering.integrator import AbstractIntegrator
 from jvr.rendering.settings import Settings
 
 
@@ -106,15 +107,13 @@ class SlicesTable(KindTable):
 
     @staticmethod
     def part(tolerance: float | None = None, **keywords: Any) -> Any:
-        from jvr.rendering.sampling import Slices
-
-        slices = Slices(**keywords)
+        slices = maker_of(AbstractIntegrator, "slices")(**keywords)
         if tolerance is None or "tolerance" not in declared(type(slices.oracle)):
             return slices
         return dataclasses.replace(slices, oracle=dataclasses.replace(slices.oracle, tolerance=tolerance))
 
 
-BASES[AbstractSampling, "slices"] = SlicesTable
+BASES[AbstractIntegrator, "slices"] = SlicesTable
 
 
 class StartTable(Table):

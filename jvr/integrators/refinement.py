@@ -8,20 +8,61 @@ predicted between good predictions is good; a feature that falls between the pix
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jvr.march.march import MarchOptions
-from jvr.model.camera import AbstractCamera
-from jvr.model.scene import Scene
+from jvr.integrators.image_plane import ImagePlane, image_plane
+from jvr.model.parameters import assign, choice
+from jvr.model.ranges import NOT_NEGATIVE, Interval
 from jvr.numerics import divide_or_zero
 from jvr.rendering.image import Rendering, RenderStats
-from jvr.rendering.medium import medium
-from jvr.rendering.pixels import ImagePlane, image_plane
-from jvr.rendering.sampling import Refinement, RefinementStats
-from jvr.rendering.settings import Settings
-from jvr.rendering.trace import Prepared, ahead, composite, enter, near_volume, prepare, step_length
+from jvr.rendering.integrator import AbstractIntegrator, View
+from jvr.rendering.marching import Uniform
+from jvr.rendering.medium import Prepared, prepare
+from jvr.rendering.trace import ahead, enter
+
+TILES = (2, 4, 8, 16, 32, 64)
+
+
+class RefinementStats(eqx.Module):
+    """What `Refinement` traced: `traced`, the pixels, and `rays`, their number and that of the rays around the picture that its border
+    is interpolated from."""
+
+    traced: Bool[Array, "height width"]
+    rays: Int[Array, ""]
+
+
+class Refinement(AbstractIntegrator):
+    """Progressive refinement, rays far apart where the picture is smooth: first every `tile`-th and `tile / 2`-th pixel, in rows and in
+    columns, then those between where interpolation was wrong by more than `tolerance` (`jvr.integrators.refinement`).
+
+    **Arguments:** `tolerance`: in radiance and opacity, 0 (every ray) or more. It bounds what interpolation was wrong by on the grid
+    before, so the picture's root mean square error stays well below it; single pixels at an edge may be farther off. `tile`: a
+    power of two, 2 ... 64; features smaller than half of it are missed where none of its rays meets them. **Raises** `ValueError` for
+    values out of range.
+
+    Colour and opacity are interpolated bilinearly, depth weighted by opacity. Differentiable in all that `jvr.render` is, through what
+    is traced and interpolated; detached: which rays are traced. `stats.steps` is 0 for pixels that were not, and `stats.sampling` a
+    `RefinementStats`. All rays are in one batch: `settings.tile` plays no part, and memory is that of a picture in one tile. A picture
+    **raises** `ValueError` for a camera of another kind than jvr's own.
+    """
+
+    tolerance: float = choice(NOT_NEGATIVE, doc="radiance and opacity, 0 for every ray", hint="0.005 is a good start")
+    tile: int = choice(Interval(2.0, 64.0), doc="pixels from one ray of the coarsest grid to the next", hint="8 is a good start")
+
+    def __init__(self, tolerance: float | int = 0.005, *, tile: int = 8):
+        assign(self, tolerance=tolerance, tile=tile)
+        if tile not in TILES:
+            raise ValueError(f"tile must be a power of two from 2 to 64 pixels, not {tile!r}; 8 is a good start")
+
+    @property
+    def explanation(self) -> str:
+        return f"every {self.tile // 2}th ray, those between where interpolation is wrong by more than {self.tolerance:g}"
+
+    def picture(self, view: View) -> Rendering:
+        return _refined(view, self.tolerance, self.tile)
 
 
 class _Grid(NamedTuple):
@@ -40,36 +81,25 @@ class _Picture(NamedTuple):
     traced: Bool[Array, "pixels"]
 
 
-# Compiled as one program also where it is called with concrete arrays; inside another program it is a part of that.
-@jax.jit
-def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sampling: Refinement) -> Rendering:
-    """Renders `scene` as `camera` sees it, tracing the rays that `sampling` chooses and interpolating between them.
-
-    Colour and opacity are interpolated bilinearly, depth weighted by opacity. Differentiable in all that `jvr.render` is, through what
-    is traced and interpolated; detached: which rays are traced. `stats.steps` is 0 for pixels that were not, and `stats.sampling` a
-    `RefinementStats`. All rays are in one batch: `settings.tile` plays no part, and memory is that of a picture in one tile. Traceable.
-
-    **Raises** `ValueError` for a camera of another kind than jvr's own.
-    """
-    scene, camera = near_volume(scene, camera)
-    plane, tile = image_plane(camera, ahead(scene, camera)), sampling.tile
+def _refined(view: View, tolerance: float, tile: int) -> Rendering:
+    scene, camera = view.scene, view.camera
+    plane, prepared = image_plane(camera, ahead(scene, camera)), prepare(scene, view.settings, view.dt)
     # The border of the picture is interpolated from real rays around it.
     height, width = (-(-(n - 1) // tile) * tile + 1 for n in (camera.height, camera.width))
     row, column = (x.reshape(-1) for x in jnp.meshgrid(*(jnp.arange(n, dtype=jnp.int32) for n in (height, width)), indexing="ij"))
     grid = _Grid(column, row, (height, width))
-    prepared = prepare(scene, settings)
 
     def refine(picture: _Picture, spacing: Int[Array, ""]) -> tuple[_Picture, Int[Array, "pixels"]]:
         fine, coarse = (~((row % s > 0) | (column % s > 0)) for s in (spacing, 2 * spacing))
         between, mask = fine & ~coarse, fine & picture.wanted & ~picture.traced
-        found, steps = _trace(scene, plane, settings, prepared, grid, mask)
+        found, steps = _trace(prepared, plane, grid, mask)
         # On the first pass the grid that predictions are made from is new, too.
         values = jnp.where((mask & coarse)[:, None], found, picture.values)
         values = jnp.where(between[:, None], _predict(values, grid, 2 * spacing), values)
         # Not "more than": a NaN is never good.
-        good = jnp.all(jnp.abs(jax.lax.stop_gradient(found - values))[:, :4] <= sampling.tolerance, axis=1)
+        good = jnp.all(jnp.abs(jax.lax.stop_gradient(found - values))[:, :4] <= tolerance, axis=1)
         wanted = _near((mask & between & ~good).reshape(height, width), grid, spacing)
-        if sampling.tolerance == 0:
+        if tolerance == 0:
             wanted = jnp.ones_like(wanted)
         values = jnp.where((mask & between)[:, None], found, values)
         return _Picture(values, wanted, picture.traced | mask), steps
@@ -88,19 +118,15 @@ def render_refined(scene: Scene, camera: AbstractCamera, settings: Settings, sam
 
 
 def _trace(
-    scene: Scene, plane: ImagePlane, settings: Settings, prepared: Prepared, grid: _Grid, mask: Bool[Array, "pixels"]
+    prepared: Prepared, plane: ImagePlane, grid: _Grid, mask: Bool[Array, "pixels"]
 ) -> tuple[Float[Array, "pixels 5"], Int[Array, "pixels"]]:
     """Colour, opacity and opacity-weighted depth of the pixels of a mask, and their steps."""
-    column, row = (x.astype(scene.volume.slope.dtype) for x in (grid.column, grid.row))
-    rays, t_in = enter(scene, *plane.rays(column, row))
+    column, row = (x.astype(prepared.scene.volume.slope.dtype) for x in (grid.column, grid.row))
+    rays, t_in = enter(prepared.scene, *plane.rays(column, row))
     # A ray without length is not marched.
-    rays = rays._replace(length=jnp.where(mask, rays.length, 0.0))
-    options = MarchOptions(settings.termination, True)
-    gathered = settings.adjoint.march(options, medium(scene, settings, prepared), rays, step_length(scene, settings))
-    rgb, alpha = composite(scene, gathered, rays.length)
-    weighted = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
-    assert gathered.steps is not None
-    return jnp.stack([*rgb, alpha, t_in * alpha + weighted], axis=1), gathered.steps
+    found = Uniform().radiance(prepared, rays._replace(length=jnp.where(mask, rays.length, 0.0)))
+    depth = t_in * found.alpha + found.distance
+    return jnp.concatenate([found.rgb, jnp.stack([found.alpha, depth], axis=1)], axis=1), found.steps
 
 
 def _predict(values: Float[Array, "pixels 5"], grid: _Grid, coarse: Int[Array, ""]) -> Float[Array, "pixels 5"]:

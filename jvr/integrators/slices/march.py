@@ -9,7 +9,7 @@ visited, from the last scalar to the new one (figures 3, 5 and 6).
 
 A slice that `2^levels` divides visits every pixel in use, so that what follows depends on nothing in front of it. The `2^levels` slices
 from one such slice to the next are a block: a function from samples to emission and optical depth of every pixel, which
-`jvr.march.slices_adjoint` differentiates as `jvr.march.adjoint` does a segment.
+`jvr.integrators.slices.adjoint` differentiates as `jvr.march.adjoint` does a segment.
 """
 
 import dataclasses
@@ -22,8 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jvr.integrators.slices.oracle import DistanceField
 from jvr.march.compact import for_each, map_selected, write
-from jvr.march.oracle import DistanceField
 from jvr.march.sums import Sums, add, join, opacity, opaque_depth, through, transmittance
 from jvr.model.volume import Volume
 from jvr.numerics import larger, rounded_into, smaller
@@ -76,7 +76,7 @@ class Lattice(NamedTuple):
     unit_slope: Scalar
 
 
-class Slices(NamedTuple):
+class Sliced(NamedTuple):
     """What is marched through: `shading` is what `SliceOptions.evaluate_segment` needs to know. Detached: `distances`."""
 
     volume: Volume
@@ -117,7 +117,7 @@ class End(NamedTuple):
     samples: Int[Array, "levels"]
 
 
-def march_slices(options: SliceOptions, slices: Slices) -> End:
+def march_slices(options: SliceOptions, slices: Sliced) -> End:
     """Accumulates all slices, front to back, until every pixel has left the volume or is opaque."""
     ended = -(-slices.lattice.last // options.period) * options.period
     pyramid, _, samples = take_slice(
@@ -138,7 +138,7 @@ def march_slices(options: SliceOptions, slices: Slices) -> End:
 
 
 def take_block(
-    options: SliceOptions, slices: Slices, ended: Int[Array, "pixels"], base: Int[Array, ""], pyramid: Pyramid, taps: Taps
+    options: SliceOptions, slices: Sliced, ended: Int[Array, "pixels"], base: Int[Array, ""], pyramid: Pyramid, taps: Taps
 ) -> tuple[Pyramid, Gathered, Int[Array, "levels"]]:
     """The slices `base + 1 ... base + 2^levels`, from the pyramid that slice `base` left, `base` a multiple of `2^levels`.
 
@@ -177,7 +177,7 @@ def take_block(
 
 
 def take_slice(
-    options: SliceOptions, slices: Slices, ended: Int[Array, "pixels"], k: Int[Array, ""], pyramid: Pyramid, taps: Taps
+    options: SliceOptions, slices: Sliced, ended: Int[Array, "pixels"], k: Int[Array, ""], pyramid: Pyramid, taps: Taps
 ) -> tuple[Pyramid, Bool[Array, "pixels"], Int[Array, "levels"]]:
     """The pyramid as slice `k` leaves it (figure 3), the pixels of the finest level that it visits, and the number of samples that it
     takes on each level; `taps` are added to them."""
@@ -215,7 +215,7 @@ def take_slice(
     return tuple(levels), visited, jnp.stack(counts)
 
 
-def _sample(slices: Slices, rays: Float[Array, "n 8"], k: Int[Array, ""], unit: Scalar, mask: Bool[Array, "n"]) -> Level:
+def _sample(slices: Sliced, rays: Float[Array, "n 8"], k: Int[Array, ""], unit: Scalar, mask: Bool[Array, "n"]) -> Level:
     """Scalar and wanted distance of the pixels of a level that are sampled."""
     volume, rays, dt, distances, unit = jax.lax.stop_gradient((slices.volume, rays, slices.dt, slices.distances, unit))
 
@@ -295,14 +295,14 @@ def add_block(sums: Sums, gathered: Gathered) -> Sums:
     return Sums(*radiance, *add(sums.tau, sums.tau_low, gathered.dtau), ())
 
 
-def blank_sums(options: SliceOptions, slices: Slices) -> Sums:
+def blank_sums(options: SliceOptions, slices: Sliced) -> Sums:
     """Sums of pixels that have gathered nothing."""
     emits, absorbs = channel_counts(options, slices)
     blank = jnp.zeros(slices.lattice.first.shape, slices.dt.dtype)
     return Sums((blank,) * (emits + absorbs), (blank,) * (emits + absorbs), (blank,) * absorbs, (blank,) * absorbs, ())
 
 
-def channel_counts(options: SliceOptions, slices: Slices) -> tuple[int, int]:
+def channel_counts(options: SliceOptions, slices: Sliced) -> tuple[int, int]:
     """How many channels the medium emits and absorbs in, by shape alone."""
     one = jax.ShapeDtypeStruct((1,), slices.dt.dtype)
     emitted, dtau = jax.eval_shape(options.evaluate_segment, slices.shading, (one, one, one))

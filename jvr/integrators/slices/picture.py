@@ -1,29 +1,32 @@
 """Adaptive sampling: pictures from samples that are far apart where a volume allows it, along the view and across it (Kraus, Strengert,
-Klein and Ertl, "Adaptive sampling in three dimensions for volume rendering on GPUs"; `jvr.march.slices` is the loop)."""
+Klein and Ertl, "Adaptive sampling in three dimensions for volume rendering on GPUs"; `jvr.integrators.slices.march` is the loop)."""
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from jvr.integrators.image_plane import ImagePlane, image_plane
+from jvr.integrators.slices.adjoint import replay_slices
+from jvr.integrators.slices.march import NEVER, Lattice, Sliced, SliceOptions
+from jvr.integrators.slices.oracle import AbstractOracle, DistanceField, LocalError, distance_field, thickness
 from jvr.march.differentiation import Replay
-from jvr.march.oracle import DistanceField, distance_field, thickness
 from jvr.march.quadrature import PreIntegrated
-from jvr.march.slices import NEVER, Lattice, SliceOptions
-from jvr.march.slices import Slices as Sliced
-from jvr.march.slices_adjoint import replay_slices
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.interpolation import Trilinear
+from jvr.model.parameters import assign, choice, parameter
 from jvr.model.preintegration import PreIntegratedTable
+from jvr.model.ranges import Interval
 from jvr.model.scene import Scene
 from jvr.model.transfer import LinearTransfer, LutTransfer
 from jvr.rendering.image import Rendering, RenderStats
-from jvr.rendering.pixels import ImagePlane, image_plane
-from jvr.rendering.sampling import Slices, SliceStats
+from jvr.rendering.integrator import AbstractIntegrator, View
+from jvr.rendering.marching import radiance_of
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import ahead, enter, near_volume, resolve, step_length
+from jvr.rendering.trace import ahead, enter
 from jvr.types import Channels, Scalar
 
 # Bricks across which the oracle is asked to look: a picture whose pixels are larger than that is coarser than the volume anyway.
@@ -31,12 +34,25 @@ FARTHEST = 32
 UNIFORM = "leave Settings(sampling=...) at jvr.Uniform()"
 
 
-# Compiled as one program also where it is called with concrete arrays; inside another program it is a part of that.
-@jax.jit
-def render_slices(
-    scene: Scene, camera: AbstractCamera, settings: Settings, sampling: Slices, *, distances: DistanceField | None = None
-) -> Rendering:
-    """Renders `scene` as `camera` sees it, from samples that `sampling` chooses.
+class SliceStats(eqx.Module):
+    """What `Slices` sampled.
+
+    - `samples`: samples of the volume taken on each level of the pyramid, the finest first, `(levels + 1,)`.
+    - `full`: slices between entry and end of each pixel, all pixels together: the samples if none is left out. The finest level
+      may take one more a pixel, behind its exit.
+    """
+
+    samples: Int[Array, "levels"]
+    full: Int[Array, ""]
+
+
+class Slices(AbstractIntegrator):
+    """Adaptive sampling on slices across the view, far apart where an oracle allows it, along the view and across it; between them the
+    scalar is interpolated, by B-splines across the view and by pre-integration along it (`jvr.integrators.slices`).
+
+    **Arguments:** `oracle`: says how far apart samples may be, within its tolerance: `jvr.LocalError()` (default),
+    `jvr.OpacityChange()`, `jvr.BrickRange()`, or `jvr.Finest()`, which allows nothing. `levels`: samples are at most `2^levels` slices
+    and pixels apart, 0 ... 5; 0 leaves none out. **Raises** `ValueError` for levels out of range.
 
     Samples lie on slices `settings.step` voxels apart, the first where the first ray enters: planes for an orthographic camera, spheres
     around the eye for a perspective one, so that slices are equally far apart along every ray. Where a ray enters and leaves, samples
@@ -44,18 +60,31 @@ def render_slices(
     The wanted distance is divided by the larger of the distance between slices and the one between pixels, so a step near the size of
     a pixel saves most.
 
-    **Arguments:** `distances`: placement to use in place of what the oracle says.
-
     Differentiable in all that `jvr.render` is, in reverse mode. Detached: which samples are taken, and where pixels end. `stats.steps`
     counts segments, `stats.sampling` is a `SliceStats`. `settings.tile` and `skipping` play no part: all pixels are in one batch. Memory:
-    about 200 bytes a pixel; with derivatives another 100 for each of the `2^levels` slices of a block. Traceable.
-
-    **Raises** `ValueError` for what it cannot render: nearest-neighbour volumes, transfer functions that are not tables, cameras other
-    than jvr's own, adjoints other than `jvr.Replay()`.
+    about 200 bytes a pixel; with derivatives another 100 for each of the `2^levels` slices of a block. A picture **raises** `ValueError`
+    for what cannot be rendered: nearest-neighbour volumes, transfer functions that are not tables, light, cameras other than jvr's own,
+    adjoints other than `jvr.Replay()`.
     """
-    scene, camera = near_volume(scene, camera)
-    table = _table(scene, settings)
-    plane, dt = image_plane(camera, ahead(scene, camera)), step_length(scene, settings)
+
+    oracle: AbstractOracle = parameter(doc="jvr.LocalError(), jvr.OpacityChange(), jvr.BrickRange() or jvr.Finest()")
+    levels: int = choice(Interval(0.0, 5.0), doc="samples are up to 2^levels slices and pixels apart")
+
+    def __init__(self, oracle: AbstractOracle = LocalError(), *, levels: int = 3):
+        assign(self, oracle=oracle, levels=levels)
+
+    @property
+    def explanation(self) -> str:
+        return f"slices, samples up to {2**self.levels} slices and pixels apart where {type(self.oracle).__name__} allows it"
+
+    def picture(self, view: View) -> Rendering:
+        return picture_of(view, self)
+
+
+def picture_of(view: View, sampling: Slices, *, distances: DistanceField | None = None) -> Rendering:
+    """The picture of a view, from samples that `sampling` chooses; `distances`: to choose by in place of what its oracle says."""
+    scene, camera, settings, dt = view
+    table, plane = _table(scene, settings), image_plane(camera, ahead(scene, camera))
     period = 2**sampling.levels
     width, height = (-(-n // period) * period for n in (camera.width, camera.height))
     options = SliceOptions(sampling.levels, width, height, settings.termination, _evaluate_segments)
@@ -70,10 +99,10 @@ def render_slices(
     gathered, ended, samples = marched
 
     crop = lambda x: x.reshape(*options.shape(0), *x.shape[1:])[1 : camera.height + 1, 1 : camera.width + 1]
-    pixels, steps = jax.tree.map(crop, (resolve(scene, gathered, finest, t_in), gathered.steps))
+    found = radiance_of(scene, gathered, finest.length)
+    rgb, alpha, depth, steps = jax.tree.map(crop, (found.rgb, found.alpha, found.depth(t_in), found.steps))
     full = jnp.where(lattice.last >= 0, jnp.minimum(ended, lattice.last) - lattice.first + 1, 0)
-    stats = RenderStats(steps, SliceStats(samples, jnp.sum(full, dtype=jnp.int32)))
-    return Rendering(pixels.rgb, pixels.alpha, pixels.depth, stats)
+    return Rendering(rgb, alpha, depth, RenderStats(steps, SliceStats(samples, jnp.sum(full, dtype=jnp.int32))))
 
 
 def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:

@@ -1,4 +1,4 @@
-"""Reverse mode through adaptive sampling on slices (`jvr.march.slices`), by replaying it.
+"""Reverse mode through adaptive sampling on slices (`jvr.integrators.slices.march`), by replaying it.
 
 Blocks of slices are walked a second time, front to back. With `T` the transmittance in front of a block, `E` and `dtau` its emission and
 optical depth, and `R` the radiance that reaches the eye from behind it, which is the whole radiance less what was gathered so far,
@@ -20,16 +20,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jvr.march.adjoint import is_there
-from jvr.march.compact import accumulate, for_each
-from jvr.march.fields import VoxelField
-from jvr.march.march import Marched
-from jvr.march.rules import values, wanted_and_fixed, with_zeros
-from jvr.march.slices import (
+from jvr.integrators.slices.march import (
     End,
     Gathered,
+    Sliced,
     SliceOptions,
-    Slices,
     Taps,
     add_block,
     blank_pyramid,
@@ -41,13 +36,18 @@ from jvr.march.slices import (
     take_block,
     take_slice,
 )
+from jvr.march.adjoint import is_there
+from jvr.march.compact import accumulate, for_each
+from jvr.march.fields import VoxelField
+from jvr.march.march import Marched
+from jvr.march.rules import values, wanted_and_fixed, with_zeros
 from jvr.march.steps import Point, Sample
 from jvr.march.sums import Sums, join, through, transmittance
 from jvr.types import Channels
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def replay_slices(options: SliceOptions, slices: Slices) -> tuple[Marched, Int[Array, "pixels"], Int[Array, "levels"]]:
+def replay_slices(options: SliceOptions, slices: Sliced) -> tuple[Marched, Int[Array, "pixels"], Int[Array, "levels"]]:
     """What the pixels gather from all slices, the last slice that each is in use on, and the samples taken on each level.
 
     Differentiable in reverse mode in volume, shading, `lattice.rays` and `dt`. Detached: which samples are taken, and where pixels end.
@@ -76,7 +76,7 @@ def _replay_backward(options: SliceOptions, residuals: Any, cotangents: Any):
 replay_slices.defvjp(_replay_forward, _replay_backward, symbolic_zeros=True)
 
 
-def replay(options: SliceOptions, slices: Slices, wanted: Any, end: End, cotangent: Marched) -> Any:
+def replay(options: SliceOptions, slices: Sliced, wanted: Any, end: End, cotangent: Marched) -> Any:
     """The gradient of `<cotangent, march>` with respect to the leaves of `wanted` that are not `None`."""
     to_sums = (*cotangent.radiance, *cotangent.distance)
 
@@ -103,7 +103,7 @@ def replay(options: SliceOptions, slices: Slices, wanted: Any, end: End, cotange
 
 
 def _block(
-    options: SliceOptions, slices: Slices, wanted: Any, ended: Int[Array, "pixels"], base: Int[Array, ""]
+    options: SliceOptions, slices: Sliced, wanted: Any, ended: Int[Array, "pixels"], base: Int[Array, ""]
 ) -> tuple[Gathered, Any]:
     """What a block gathers, and the function that pulls cotangents of its emission and optical depth back to shading, rays of the finest
     level and `dt`, as far as they are wanted, and to the samples of slices `base ... base + 2^levels`."""
@@ -123,7 +123,7 @@ def _block(
     return gathered, pull
 
 
-def _deposit(options: SliceOptions, slices: Slices, base: Int[Array, ""], cotangents: Taps, gradient: Any) -> Any:
+def _deposit(options: SliceOptions, slices: Sliced, base: Int[Array, ""], cotangents: Taps, gradient: Any) -> Any:
     """Adds the derivative of the samples of a block to the gradient."""
     if not jax.tree.leaves((gradient.volume, gradient.lattice.rays, gradient.dt)):
         return gradient
@@ -138,7 +138,7 @@ def _deposit(options: SliceOptions, slices: Slices, base: Int[Array, ""], cotang
     return jax.lax.fori_loop(jnp.int32(0), jnp.int32(options.period + 1), one, gradient)
 
 
-def _deposit_level(slices: Slices, level: int, k: Int[Array, ""], cotangent: Float[Array, "pixels"], gradient: Any) -> Any:
+def _deposit_level(slices: Sliced, level: int, k: Int[Array, ""], cotangent: Float[Array, "pixels"], gradient: Any) -> Any:
     """Adds the derivative of the samples of one level of a slice. Where the cotangent is zero, as where none was taken, nothing is done."""
     volume, rays = slices.volume, slices.lattice.rays[level]
 
