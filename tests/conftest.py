@@ -6,8 +6,8 @@ from importlib import metadata
 from pathlib import Path
 
 os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "false")
-# The rest goes into traces: a tenth of it into saying in each program which line of Python an operation comes from, and a sixth into looking
-# for garbage among millions of objects that are none.
+# The rest goes into traces: a tenth of it into saying in each program which line of Python an operation comes from, and a sixth into
+# looking for garbage among millions of objects that are none.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 gc.set_threshold(200_000, 10, 10)
 # Most of the time goes into compiling programs that run for a moment: a quarter of it without what makes them fast.
