@@ -21,7 +21,7 @@ from jvr.march.shaders import GradientFrame, OpticalShader, PreIntegratedShader,
 from jvr.march.steps import Point, Sample
 from jvr.model.by_value import at_value
 from jvr.model.effects import AbstractScattering, AbstractShading
-from jvr.model.light import AbstractEmitter, AbstractLight, AmbientLight
+from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
 from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
 from jvr.numerics import direction_and_length, transformed, turned
@@ -48,7 +48,7 @@ class LitShader(OpticalShader):
     """The optical model of a medium that shows light."""
 
     world_from_grid: Affine
-    lights: tuple[AbstractEmitter, ...]
+    lights: tuple[AbstractLight, ...]
     shading: AbstractShading | None
     scattering: AbstractScattering | None
     cut: CutFaces | None = None  # where surfaces are clipped
@@ -84,7 +84,7 @@ class LitShader(OpticalShader):
         glows = shading is None and self.environment is None
         factor, added = [zero + 1 if glows else zero] * 3, [zero] * 3
         for i, light in enumerate(self.lights):
-            if not isinstance(light, AbstractLight):
+            if not isinstance(light, AbstractDeltaLight):
                 continue
             w_i, _, irradiance = light.sample(x, w_o)
             incident = _times(irradiance, sample.light.of_light(i))

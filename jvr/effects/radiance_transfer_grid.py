@@ -49,7 +49,7 @@ class RadianceTransferVisibility(AbstractVisibility):
 
 def radiance_transfer_visibility(scene: Scene, medium: Medium) -> RadianceTransferVisibility:
     """How much of the environment reaches each sample of a scene. `medium`: what rays pass."""
-    radiance_transfer, environment = radiance_transfer_of(scene), scene.environment
+    radiance_transfer, environment = radiance_transfer_of(scene), scene.environment_light
     assert environment is not None
     assert scene.material is not None
     material = scene.material

@@ -13,7 +13,7 @@ from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Rays, Transmittances
 from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractShadows
-from jvr.model.light import AbstractLight
+from jvr.model.light import AbstractDeltaLight
 from jvr.model.parameters import assign, choice
 from jvr.model.parts import AbstractPart, Knob, multiples
 from jvr.model.ranges import POSITIVE, TRANSMITTANCE
@@ -57,7 +57,7 @@ class RayVisibility(AbstractVisibility):
     """Visibility by shadow rays to each light through `medium`, which emits nothing; or `None` for lights that nothing shades."""
 
     clipping: ClippingBox | None
-    lights: tuple[AbstractLight | None, ...]
+    lights: tuple[AbstractDeltaLight | None, ...]
     medium: Medium
     dt: Scalar
     options: MarchOptions = eqx.field(static=True)
@@ -69,13 +69,13 @@ class RayVisibility(AbstractVisibility):
     def stats(self) -> None:
         return None
 
-    def _one(self, light: AbstractLight, points: Point, wanted: Bool[Array, "rays"], reverse: bool) -> Channels:
+    def _one(self, light: AbstractDeltaLight, points: Point, wanted: Bool[Array, "rays"], reverse: bool) -> Channels:
         rays = self._rays(light, points, wanted)
         through = replay_march if reverse else march
         gathered: Marched = through(self.options, self.medium, rays, self.dt)
         return tuple(jnp.exp(-tau) for tau in gathered.tau)
 
-    def _rays(self, light: AbstractLight, points: Point, wanted: Bool[Array, "rays"]) -> Rays:
+    def _rays(self, light: AbstractDeltaLight, points: Point, wanted: Bool[Array, "rays"]) -> Rays:
         """From the points to a light; without length where they are not wanted."""
         field, clipping = self.medium.field, self.clipping
         assert isinstance(field, VoxelField)

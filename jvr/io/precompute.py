@@ -65,8 +65,7 @@ def precompute(
     `keep_unscattered`: leave the scattering pass to each picture, so that material and dipole can be fitted.
     Not traceable. Warns where a result cannot be written. **Raises** `OSError` where the folder cannot be made.
     """
-    environment = scene.environment
-    if environment is None:
+    if scene.environment_light is None:
         return scene
     scene = dataclasses.replace(scene, volume=scene.volume.current())
     folder = None if cache is None else Path(cache)
@@ -120,7 +119,7 @@ def _bare(volume: Volume) -> Volume:
 
 def as_precomputed(scene: Scene) -> Scene:
     """A scene of the same structure as `precompute` makes of it, at once and with zeros for what it computes: for `jvr.plan`."""
-    if scene.environment is None:
+    if scene.environment_light is None:
         return scene
     order = _material_order(scene)
 

@@ -12,6 +12,7 @@ import jvr
 from jvr.march.medium import AbstractVisibility
 from jvr.march.steps import Transmittances
 from jvr.model.effects import AbstractShadows
+from jvr.model.light import AbstractLight
 
 LENGTH, SIGMA = 8.0, 0.3
 COLOUR = np.array([0.9, 0.5, 0.2])
@@ -556,3 +557,18 @@ def test_each_light_has_a_slot_of_visibility():
     found = picture(1.0, 1.0, 1.0, 1.0, FractionalShadows())
     np.testing.assert_allclose(found, picture(0.5, 0.125, 0.25, 0.75), rtol=1e-5, atol=1e-6)
     assert np.max(np.abs(found - picture(0.5, 0.25, 0.125, 0.75))) > 1e-3
+
+
+class Lantern(AbstractLight):
+    """A light that says nothing of what arrives."""
+
+    def moved(self, origin):
+        return self
+
+
+def test_lights_are_one_family():
+    """All are moved with the world; one that nothing could show is refused."""
+    for light in (jvr.DirectionalLight((1, 0, 0)), jvr.AmbientLight(), jvr.HeadLight(), jvr.EnvironmentLight.constant()):
+        assert isinstance(light, AbstractLight)
+    with pytest.raises(TypeError, match=r"nothing shows a Lantern: derive it from jvr\.model\.light\.AbstractDeltaLight"):
+        jvr.Scene(slab(), medium(), lights=(Lantern(),), shading=jvr.Lambert())
