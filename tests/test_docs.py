@@ -23,20 +23,20 @@ import jvr
 from docs import reference
 from jvr import cli
 from jvr.cli.app import app
+from jvr.integrators.slices.oracle import AbstractOracle
 from jvr.io.config import build_fit, build_scene, config_from
 from jvr.io.config.schema.parts import kinds_of, table_for
 from jvr.march.differentiation import AbstractAdjoint
-from jvr.march.oracle import AbstractOracle
 from jvr.march.quadrature import AbstractQuadrature
 from jvr.model.camera import AbstractCamera
 from jvr.model.effects import AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
-from jvr.model.light import AbstractEmitter
+from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
 from jvr.model.phase import AbstractPhase
 from jvr.names import NAMES
-from jvr.rendering.sampling import AbstractSampling
+from jvr.rendering.integrator import AbstractIntegrator
 
 PUBLIC = {name for names in NAMES.values() for name in names}
 LANGUAGES = {"python", "sh", "toml", "math", "bibtex"}
@@ -162,7 +162,7 @@ def test_saved_scenes_are_valid(block, tmp_path):
 
 
 FAMILIES = {
-    "[[lights]]": AbstractEmitter,
+    "[[lights]]": AbstractLight,
     "[shading]": AbstractShading,
     "[shadows]": AbstractShadows,
     "[scattering.phase]": AbstractPhase,
@@ -172,7 +172,7 @@ FAMILIES = {
     "[camera]": AbstractCamera,
     "[settings.quadrature]": AbstractQuadrature,
     "[settings.adjoint]": AbstractAdjoint,
-    "[settings.sampling]": AbstractSampling,
+    "[settings.sampling]": AbstractIntegrator,
     "[settings.sampling.oracle]": AbstractOracle,
 }
 

@@ -130,13 +130,21 @@ def test_no_cycles():
         visit(name)
 
 
-# Where the path of a module of integrators stands: lists of what there is.
+# Where the path of a module of integrators or effects stands: lists of what there is.
 REGISTRY = {"jvr.names", "jvr.io.kinds", "jvr.io.exported"}
 
 
 def test_an_integrators_module_is_named_by_registries_alone():
     named = {name for path, name in MODULES.items() if "jvr.integrators" in path.read_text(encoding="utf-8")}
     assert {name for name in named if _part(name) != "integrators"} == REGISTRY
+
+
+def test_an_effects_module_is_named_by_registries_alone():
+    """And by one line, what shows light."""
+    texts = {name: path.read_text(encoding="utf-8") for path, name in MODULES.items() if _part(name) != "effects"}
+    named = {name for name, text in texts.items() if "jvr.effects" in text}
+    assert named - REGISTRY == {"jvr.rendering.medium"}
+    assert texts["jvr.rendering.medium"].count("jvr.effects") == 1
 
 
 def test_what_makes_pictures_and_fits_knows_no_integrator_by_name():

@@ -15,7 +15,7 @@ class Beforehand:
         self.report: list[dict[str, Any]] = []
 
     def __call__(self, scene: "Scene", **keywords: Any) -> "Scene":
-        if scene.environment is None:
+        if scene.environment_light is None:
             return scene
         from jvr.io.precompute import precompute
 

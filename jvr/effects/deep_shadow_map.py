@@ -11,10 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jvr.effects.light_space import AbstractLightSpace, bilinear, light_space, of_swept
 from jvr.effects.shadow_volume import texels
-from jvr.march.medium import AbstractVisibility, Medium
-from jvr.march.steps import Point
+from jvr.march.medium import AbstractVisibility, LightPath
+from jvr.march.steps import Point, Transmittances
 from jvr.model.effects import AbstractShadows
-from jvr.model.light import AbstractLight
 from jvr.model.parameters import assign, choice
 from jvr.model.parts import Knob, multiples
 from jvr.model.ranges import AT_LEAST_ONE, FRACTION
@@ -44,11 +43,11 @@ class DeepShadowMap(AbstractShadows):
     def __init__(self, texels: int = 128, layers: int = 12, *, error: float = 0.01):
         assign(self, texels=texels, layers=layers, error=error)
 
-    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, path: LightPath) -> AbstractVisibility:
         steps = max(self.layers, math.ceil(math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape))))
-        maps = []
-        for light in lights:
-            space = light_space(light, scene.volume) if light.casts_shadows else None
+        maps, medium = [], path(scene.transfer.takes_gradient)
+        for light in scene.shadow_casters:
+            space = None if light is None else light_space(light, scene.volume)
             if space is None:
                 maps.append(None)
                 continue
@@ -103,9 +102,9 @@ class DeepVisibility(AbstractVisibility):
     world_from_grid: Affine
     maps: tuple[DeepMap | None, ...]
 
-    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> Transmittances:
         x = transformed(self.world_from_grid, points.p)
-        return tuple(() if deep is None else jax.vmap(deep.transmittance)(x) for deep in self.maps)
+        return Transmittances(tuple(() if deep is None else jax.vmap(deep.transmittance)(x) for deep in self.maps))
 
     @property
     def stats(self) -> ShadowStats:

@@ -204,7 +204,7 @@ def _in_plane(order: int) -> np.ndarray:
 def environment_lighting_of(scene: Scene) -> EnvironmentLighting:
     """A scene's material under its environment. Where samples bring the coefficients of what arrives, those of a product, the order is
     that of the material, else also that of the light."""
-    environment = scene.environment
+    environment = scene.environment_light
     assert environment is not None
     assert scene.material is not None
     material: HarmonicMaterial = scene.material.projected(scene.material_order)

@@ -19,7 +19,7 @@ from jvr.execution.devices import over_rays, shares
 from jvr.march.medium import Medium
 from jvr.march.segments import classify_at
 from jvr.march.steps import Point
-from jvr.model.light import AbstractLight, DirectionalLight, perpendicular
+from jvr.model.light import AbstractDeltaLight, DirectionalLight, perpendicular
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
 from jvr.numerics import clamp, direction_and_length, dot, larger, ray_box, rounded_into, smaller
@@ -97,7 +97,7 @@ class FanSpace(AbstractLightSpace):
         return tuple(self.position[i] + self.near * d[i] for i in range(3)), d, self.far - self.near
 
 
-def light_space(light: AbstractLight, volume: Volume) -> AbstractLightSpace:
+def light_space(light: AbstractDeltaLight, volume: Volume) -> AbstractLightSpace:
     """The coordinates of a light around a volume; differentiable in both."""
     if isinstance(light, DirectionalLight):
         along, _ = direction_and_length((light.direction[0], light.direction[1], light.direction[2]))

@@ -14,16 +14,34 @@ import jax
 import jax.numpy as jnp
 
 from jvr.effects.cut import CutFaces
+from jvr.effects.environment_lighting import EnvironmentLighting, environment_lighting_of
 from jvr.effects.self_shadow import ShadedSegment
 from jvr.effects.shading import surface_weight
-from jvr.march.shaders import OpticalShader, PreIntegratedShader, where_known
+from jvr.march.shaders import GradientFrame, OpticalShader, PreIntegratedShader, where_known
 from jvr.march.steps import Point, Sample
 from jvr.model.by_value import at_value
 from jvr.model.effects import AbstractScattering, AbstractShading
-from jvr.model.light import AbstractLight, AmbientLight
+from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
+from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
 from jvr.numerics import direction_and_length, transformed, turned
 from jvr.types import Affine, Channels, Scalar, Triple
+
+
+def prepare(scene: Scene) -> EnvironmentLighting | None:
+    """What is computed once for all rays through a scene that shows light: its material under environment lighting."""
+    return None if scene.material is None else environment_lighting_of(scene)
+
+
+def lit_shader(
+    scene: Scene, frame: GradientFrame | None, prepared: EnvironmentLighting | None, *, pre_integrated: bool
+) -> "LitShader":
+    """The shader of a scene that shows light; `frame`: how gradients come about, where something asks for them."""
+    kind = LitPreIntegratedShader if pre_integrated else LitShader
+    cut, volume = None, scene.volume
+    if scene.clipping is not None and frame is not None:
+        cut = CutFaces(scene.clipping, jnp.min(volume.spacing))
+    return kind(scene.optical, frame, volume.world_from_grid, scene.lights, scene.shading, scene.scattering, cut, prepared)
 
 
 class LitShader(OpticalShader):
@@ -31,11 +49,10 @@ class LitShader(OpticalShader):
 
     world_from_grid: Affine
     lights: tuple[AbstractLight, ...]
-    ambient: tuple[AmbientLight, ...]
     shading: AbstractShading | None
     scattering: AbstractScattering | None
     cut: CutFaces | None = None  # where surfaces are clipped
-    environment: Any = None  # a `jvr.effects.environment_lighting.EnvironmentLighting`, where the scene has an environment
+    environment: EnvironmentLighting | None = None
 
     def shade(self, classified: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         factor, added = self.light_at(sample, point, classified, dt)
@@ -66,10 +83,11 @@ class LitShader(OpticalShader):
         # A medium that nothing reflects from glows as it is.
         glows = shading is None and self.environment is None
         factor, added = [zero + 1 if glows else zero] * 3, [zero] * 3
-        transmittances = sample.light or ((),) * (len(self.lights) + 1)
-        for light, transmittance in zip(self.lights, transmittances, strict=False):
+        for i, light in enumerate(self.lights):
+            if not isinstance(light, AbstractDeltaLight):
+                continue
             w_i, _, irradiance = light.sample(x, w_o)
-            incident = _times(irradiance, transmittance)
+            incident = _times(irradiance, sample.light.of_light(i))
             if shading is not None:
                 diffuse, specular = shading.reflect(surface, normal, w_o, w_i)
                 factor = [f + reflects * diffuse * e for f, e in zip(factor, incident, strict=True)]
@@ -78,16 +96,18 @@ class LitShader(OpticalShader):
             if scattering is not None:
                 scattered = _times(incident, scattering.scatter(w_o, w_i))
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
-        for light in self.ambient:
+        for light in self.lights:
+            if not isinstance(light, AmbientLight):
+                continue
+            incident = _times(light.rgb, sample.light.ambient)
             if shading is not None:
-                factor = [f + reflects * shading.ambient_reflectance() * e for f, e in zip(factor, light.rgb, strict=True)]
+                factor = [f + reflects * shading.ambient_reflectance() * e for f, e in zip(factor, incident, strict=True)]
             if scattering is not None:
-                scattered = _times(light.rgb, scattering.scatter_ambient())
+                scattered = _times(incident, scattering.scatter_ambient())
                 added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
         if self.environment is not None:
-            around = transmittances[len(self.lights)] if len(transmittances) > len(self.lights) else ()
             here = ShadedSegment(classified, sample.gradient, dt)
-            tinted, unmodulated = self.environment.reflect(sample.s, magnitude, normal, w_o, around, cut, here)
+            tinted, unmodulated = self.environment.reflect(sample.s, magnitude, normal, w_o, sample.light.environment, cut, here)
             factor = [f + reflects * c for f, c in zip(factor, tinted, strict=True)]
             added = [b + reflects * c for b, c in zip(added, unmodulated, strict=True)]
         return tuple(factor), tuple(added)

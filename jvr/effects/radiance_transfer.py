@@ -17,6 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array, UInt32
 
 from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
+from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.model.dipole import Dipole
 from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
 from jvr.model.harmonics.basis import count
@@ -175,8 +176,27 @@ class RadianceTransfer(AbstractRadianceTransfer):
         # The exact product first: what it costs hides the rest.
         return (self.turned("exact", False),) if self.exact else super().coarser(scene)
 
+    # What computes and what reads it is imported for scenes alone that are drawn or computed beforehand.
+
+    def visibility(self, scene: Any, path: LightPath) -> AbstractVisibility:
+        from jvr.effects.radiance_transfer_grid import radiance_transfer_visibility
+
+        return radiance_transfer_visibility(scene, self._medium(scene, path))
+
+    def projection(self, scene: Any, path: LightPath) -> Any:
+        from jvr.effects.radiance_transfer_grid import RadianceTransferProjection
+
+        return RadianceTransferProjection.of(scene, self._medium(scene, path))
+
+    def finished(self, scene: Any, *nodes: Any) -> ProjectedRadianceTransfer:
+        from jvr.effects.radiance_transfer_grid import finished
+
+        return finished(scene, *nodes)
+
+    def _medium(self, scene: Any, path: LightPath) -> Medium:
+        return path(scene.transfer.takes_gradient or self.rays_need_gradient)
+
     def with_projected(self, projected: ProjectedRadianceTransfer) -> "RadianceTransfer":
-        """The same, computed beforehand."""
         return eqx.tree_at(lambda t: t.projected, self, projected, is_leaf=lambda x: x is None)
 
     @property

@@ -19,47 +19,37 @@ from jvr.effects.radiance_transfer_nodes import CHUNK, node_positions, project_n
 from jvr.execution.devices import over_rays, shares
 from jvr.execution.tiles import dealt, joined
 from jvr.march.medium import AbstractVisibility, Medium
-from jvr.march.steps import Point
+from jvr.march.steps import Point, Transmittances
 from jvr.model.clipping import ClippingBox
 from jvr.model.harmonics.algebra import product_matrix
 from jvr.model.harmonics.basis import band_of, basis
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
 from jvr.numerics import direction_and_length, divide_or_zero
-from jvr.types import Channels
 
 # Weight of the environment lighting beside that which a surface faces.
 DARK = 0.005
 
 
 class RadianceTransferVisibility(AbstractVisibility):
-    """What `inner` says of the scene's lights and, as one more light, of the environment: the fraction of it that arrives in each colour,
-    or the coefficients of what arrives, all colours of the first, then of the next."""
+    """What arrives of the environment: the fraction of it in each colour, or the coefficients of what arrives, all colours of the first,
+    then of the next; beside them, where surfaces shadow themselves, how much of one there is."""
 
     grid: Grid
     scale: tuple[float, float, float] = eqx.field(static=True)
-    inner: AbstractVisibility | None
-    lights: int = eqx.field(static=True)
 
-    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
-        none = ((),) * self.lights
-        own = none if self.inner is None else self.inner.transmittances(points, wanted, reverse=reverse)
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> Transmittances:
         at = tuple(c * f for c, f in zip(points.p, self.scale, strict=True))
-        return (*own, self.grid.interpolate(at, wanted))
+        return Transmittances(environment=self.grid.interpolate(at, wanted))
 
     @property
-    def stats(self) -> Any:
-        return None if self.inner is None else self.inner.stats
+    def stats(self) -> None:
+        return None
 
 
-def radiance_transfer_visibility(
-    scene: Scene, medium: Medium, inner: AbstractVisibility | None, lights: int
-) -> RadianceTransferVisibility:
-    """How much of the environment reaches each sample of a scene.
-
-    **Arguments:** `medium`: what rays pass; `lights`: how many others `inner` knows.
-    """
-    radiance_transfer, environment = radiance_transfer_of(scene), scene.environment
+def radiance_transfer_visibility(scene: Scene, medium: Medium) -> RadianceTransferVisibility:
+    """How much of the environment reaches each sample of a scene. `medium`: what rays pass."""
+    radiance_transfer, environment = radiance_transfer_of(scene), scene.environment_light
     assert environment is not None
     assert scene.material is not None
     material = scene.material
@@ -80,7 +70,7 @@ def radiance_transfer_visibility(
         incident = jnp.concatenate([incident, projected.solid[..., None]], axis=-1)
     shape = coefficients.shape[:3]
     x, y, z = ((m - 1) / (n - 1) if n > 1 else 0.0 for n, m in zip(scene.volume.shape, shape, strict=True))
-    return RadianceTransferVisibility(Grid.of(incident), (x, y, z), inner, lights)
+    return RadianceTransferVisibility(Grid.of(incident), (x, y, z))
 
 
 def radiance_transfer_of(scene: Scene) -> RadianceTransfer:
@@ -117,6 +107,10 @@ class RadianceTransferProjection(eqx.Module):
 
     def positions(self) -> np.ndarray:
         return node_positions(self.volume, self.radiance_transfer.shape(self.volume))
+
+    def all_nodes(self) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
+        """`project_all` of it."""
+        return project_all(self)
 
     def nodes(self, index: Int[Array, "nodes"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
         """The radiance transfer of some nodes, a chunk at a time."""

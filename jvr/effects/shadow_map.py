@@ -7,16 +7,15 @@ from jaxtyping import Array, Bool, Float
 
 from jvr.effects.light_space import AbstractLightSpace, depth_nodes, light_space
 from jvr.effects.shadow_volume import samples_a_layer, texels
-from jvr.march.medium import AbstractVisibility, Medium
-from jvr.march.steps import Point
+from jvr.march.medium import AbstractVisibility, LightPath, Medium
+from jvr.march.steps import Point, Transmittances
 from jvr.model.effects import AbstractShadows
-from jvr.model.light import AbstractLight
 from jvr.model.parameters import assign, choice
 from jvr.model.parts import Knob, multiples
 from jvr.model.ranges import FRACTION, NOT_NEGATIVE
 from jvr.model.scene import Scene
 from jvr.numerics import read_at, transformed
-from jvr.types import Affine, Channels, Scalar, Triple
+from jvr.types import Affine, Scalar, Triple
 
 # Layers in which the depth of an occluder is looked for; inside of one it is interpolated.
 LAYERS = 256
@@ -42,10 +41,11 @@ class ShadowMap(AbstractShadows):
     def __init__(self, texels: int = 256, *, threshold: float = 0.5, softness: int = 1, bias: float | int = 1.5):
         assign(self, texels=texels, threshold=threshold, softness=softness, bias=bias)
 
-    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
-        maps = []
-        for light in lights:
-            space = light_space(light, scene.volume) if light.casts_shadows else None
+    def visibility(self, scene: Scene, path: LightPath) -> AbstractVisibility:
+        medium = path(scene.transfer.takes_gradient)
+        spacing, maps = jnp.min(scene.volume.spacing), []
+        for light in scene.shadow_casters:
+            space = None if light is None else light_space(light, scene.volume)
             maps.append(None if space is None else self._map(space, scene, medium, spacing))
         return jax.lax.stop_gradient(MapVisibility(scene.volume.world_from_grid, tuple(maps), self.softness))
 
@@ -96,10 +96,10 @@ class MapVisibility(AbstractVisibility):
     maps: tuple[DepthMap | None, ...]
     softness: int = eqx.field(static=True)
 
-    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> Transmittances:
         x = jax.lax.stop_gradient(transformed(self.world_from_grid, points.p))
         fraction = lambda depths: jax.vmap(lambda x: depths.lit_fraction(x, self.softness))(x)
-        return tuple(() if depths is None else (fraction(depths),) for depths in self.maps)
+        return Transmittances(tuple(() if depths is None else (fraction(depths),) for depths in self.maps))
 
     @property
     def stats(self) -> None:

@@ -9,11 +9,11 @@ from jvr.effects.shadow_volume import ShadowVolume
 from jvr.march.adjoint import replay_march
 from jvr.march.fields import VoxelField
 from jvr.march.march import Marched, MarchOptions, march
-from jvr.march.medium import AbstractVisibility, Medium
-from jvr.march.steps import Point, Rays
+from jvr.march.medium import AbstractVisibility, LightPath, Medium
+from jvr.march.steps import Point, Rays, Transmittances
 from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractShadows
-from jvr.model.light import AbstractLight
+from jvr.model.light import AbstractDeltaLight
 from jvr.model.parameters import assign, choice
 from jvr.model.parts import AbstractPart, Knob, multiples
 from jvr.model.ranges import POSITIVE, TRANSMITTANCE
@@ -41,8 +41,10 @@ class ShadowRays(AbstractShadows):
     def __init__(self, step: float | int = 1.0, *, termination: float | int = 1e-3):
         assign(self, step=step, termination=termination)
 
-    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
-        return RayVisibility(scene.clipping, lights, medium, self.step * spacing, MarchOptions(self.termination, distance=False))
+    def visibility(self, scene: Scene, path: LightPath) -> AbstractVisibility:
+        options = MarchOptions(self.termination, distance=False)
+        medium = path(scene.transfer.takes_gradient)
+        return RayVisibility(scene.clipping, scene.shadow_casters, medium, self.step * jnp.min(scene.volume.spacing), options)
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
         return (multiples("step", self.step, (4, 2, 1, 1 / 2), 1 / 4),)
@@ -52,30 +54,28 @@ class ShadowRays(AbstractShadows):
 
 
 class RayVisibility(AbstractVisibility):
-    """Visibility by shadow rays through `medium`, which emits nothing."""
+    """Visibility by shadow rays to each light through `medium`, which emits nothing; or `None` for lights that nothing shades."""
 
     clipping: ClippingBox | None
-    lights: tuple[AbstractLight, ...]
+    lights: tuple[AbstractDeltaLight | None, ...]
     medium: Medium
     dt: Scalar
     options: MarchOptions = eqx.field(static=True)
 
-    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
-        return tuple(self._one(light, points, wanted, reverse) for light in self.lights)
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> Transmittances:
+        return Transmittances(tuple(() if light is None else self._one(light, points, wanted, reverse) for light in self.lights))
 
     @property
     def stats(self) -> None:
         return None
 
-    def _one(self, light: AbstractLight, points: Point, wanted: Bool[Array, "rays"], reverse: bool) -> Channels:
-        if not light.casts_shadows:
-            return ()
+    def _one(self, light: AbstractDeltaLight, points: Point, wanted: Bool[Array, "rays"], reverse: bool) -> Channels:
         rays = self._rays(light, points, wanted)
         through = replay_march if reverse else march
         gathered: Marched = through(self.options, self.medium, rays, self.dt)
         return tuple(jnp.exp(-tau) for tau in gathered.tau)
 
-    def _rays(self, light: AbstractLight, points: Point, wanted: Bool[Array, "rays"]) -> Rays:
+    def _rays(self, light: AbstractDeltaLight, points: Point, wanted: Bool[Array, "rays"]) -> Rays:
         """From the points to a light; without length where they are not wanted."""
         field, clipping = self.medium.field, self.clipping
         assert isinstance(field, VoxelField)

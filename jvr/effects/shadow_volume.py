@@ -9,16 +9,15 @@ from jaxtyping import Array, Bool
 
 from jvr.effects.grid import Grid
 from jvr.effects.light_space import AbstractLightSpace, depth_nodes, light_space
-from jvr.march.medium import AbstractVisibility, Medium
-from jvr.march.steps import Point
+from jvr.march.medium import AbstractVisibility, LightPath
+from jvr.march.steps import Point, Transmittances
 from jvr.model.effects import AbstractShadows
-from jvr.model.light import AbstractLight
 from jvr.model.parameters import assign, choice
 from jvr.model.parts import Knob, multiples
 from jvr.model.ranges import AT_LEAST_ONE, Interval
 from jvr.model.scene import Scene
 from jvr.numerics import transformed
-from jvr.types import Affine, Channels, Scalar, Triple
+from jvr.types import Affine, Channels, Triple
 
 
 def texels() -> Any:
@@ -42,10 +41,10 @@ class ShadowVolume(AbstractShadows):
     def __init__(self, resolution: float | int = 1 / 3):
         assign(self, resolution=resolution)
 
-    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
+    def visibility(self, scene: Scene, path: LightPath) -> AbstractVisibility:
         diagonal = math.sqrt(sum((n - 1) ** 2 for n in scene.volume.shape))
         nodes = max(2, math.ceil(self.resolution * diagonal))
-        return depth_visibility(scene, lights, medium, nodes + 1, nodes, math.ceil(0.5 / self.resolution))
+        return depth_visibility(scene, path, nodes + 1, nodes, math.ceil(0.5 / self.resolution))
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
         return (multiples("resolution", self.resolution, (1 / 4, 1 / 2, 1, 2), 4, most=4.0),)
@@ -67,8 +66,8 @@ class OpacityShadowMap(AbstractShadows):
     def __init__(self, texels: int = 128, layers: int = 32):
         assign(self, texels=texels, layers=layers)
 
-    def visibility(self, scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, spacing: Scalar) -> AbstractVisibility:
-        return depth_visibility(scene, lights, medium, self.texels, self.layers, samples_a_layer(scene, self.layers))
+    def visibility(self, scene: Scene, path: LightPath) -> AbstractVisibility:
+        return depth_visibility(scene, path, self.texels, self.layers, samples_a_layer(scene, self.layers))
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
         return multiples("texels", self.texels, (1 / 2, 1, 2), 3, least=2), multiples(
@@ -96,22 +95,20 @@ class DepthVisibility(AbstractVisibility):
     world_from_grid: Affine
     grids: tuple[ClearGrid | None, ...]
 
-    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> Transmittances:
         x = transformed(self.world_from_grid, points.p)
-        return tuple(() if grid is None else grid.transmittance(x, wanted) for grid in self.grids)
+        return Transmittances(tuple(() if grid is None else grid.transmittance(x, wanted) for grid in self.grids))
 
     @property
     def stats(self) -> None:
         return None
 
 
-def depth_visibility(
-    scene: Scene, lights: tuple[AbstractLight, ...], medium: Medium, texels: int, layers: int, samples: int
-) -> DepthVisibility:
+def depth_visibility(scene: Scene, path: LightPath, texels: int, layers: int, samples: int) -> DepthVisibility:
     """A grid of `texels^2 (layers + 1)` nodes for each light that casts shadows."""
-    grids = []
-    for light in lights:
-        space = light_space(light, scene.volume) if light.casts_shadows else None
+    grids, medium = [], path(scene.transfer.takes_gradient)
+    for light in scene.shadow_casters:
+        space = None if light is None else light_space(light, scene.volume)
         if space is None:
             grids.append(None)
             continue

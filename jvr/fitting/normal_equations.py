@@ -81,7 +81,7 @@ def _light_tangents(problem: Problem, values: Float[Array, "unknowns"]) -> Light
 
     def around(part: Array) -> tuple[Any, Any]:
         prepared = prepare_in_fit(kinds.changed(part, values).scene, problem.settings, problem.skips)
-        return eqx.partition(prepared.shadows, eqx.is_inexact_array)
+        return eqx.partition(prepared.visibility, eqx.is_inexact_array)
 
     part = values[kinds.inner]
     if not part.size:

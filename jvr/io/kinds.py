@@ -20,7 +20,7 @@ from jvr.model.effects import (
 )
 from jvr.model.environment import EnvironmentLight
 from jvr.model.interpolation import AbstractInterpolation
-from jvr.model.light import AbstractEmitter
+from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbstractOpticalModel
@@ -37,7 +37,7 @@ PARTS: dict[str, str | type] = {
 # What configurations call the classes of a family, or functions that make one, whose tables are the arguments of their constructors. Kinds
 # whose tables say something else, such as a file, are in `jvr.io.config.schema`.
 KINDS: dict[type, dict[str, str]] = {
-    AbstractEmitter: {
+    AbstractLight: {
         "directional": "DirectionalLight",
         "point": "PointLight",
         "spot": "SpotLight",

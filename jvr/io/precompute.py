@@ -17,9 +17,6 @@ import numpy as np
 from jaxtyping import Array
 
 from jvr.atomic import replacing
-from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
-from jvr.effects.radiance_transfer import MaterialBleeding
-from jvr.effects.radiance_transfer_grid import RadianceTransferProjection, finished, project_all, radiance_transfer_of
 from jvr.execution.devices import everywhere, over_rays, shares
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
@@ -68,8 +65,7 @@ def precompute(
     `keep_unscattered`: leave the scattering pass to each picture, so that material and dipole can be fitted.
     Not traceable. Warns where a result cannot be written. **Raises** `OSError` where the folder cannot be made.
     """
-    environment = scene.environment
-    if environment is None:
+    if scene.environment_light is None:
         return scene
     scene = dataclasses.replace(scene, volume=scene.volume.current())
     folder = None if cache is None else Path(cache)
@@ -88,12 +84,13 @@ def precompute(
         if not scene.radiance_transfer.stale(scene):
             return scene
         scene = eqx.tree_at(lambda s: s.radiance_transfer.projected, scene, None)
-    radiance_transfer = radiance_transfer_of(scene)
+    radiance_transfer = scene.radiance_transfer
+    assert radiance_transfer is not None
     if keep_unscattered and radiance_transfer.scattering is not None:
         scene = eqx.tree_at(lambda s: s.radiance_transfer.scattering, scene, None)
     # The light plays no part, and the material where rays do not pick up its colour none but that it has a normal.
     plays, normal = (
-        isinstance(radiance_transfer.bleeding, MaterialBleeding),
+        radiance_transfer.rays_need_gradient,
         scene.material is not None and scene.material.needs_gradient,
     )
     inputs = (
@@ -104,7 +101,7 @@ def precompute(
         scene.radiance_transfer,
         scene.material if plays else np.asarray(normal),
     )
-    whole = lambda _: finished(scene, *project_all(_projection(scene)))
+    whole = lambda _: _finished(scene, *_projection(scene).all_nodes())
     projected = _kept(
         folder, whole, inputs, lambda: _project(scene, progress or (lambda share: None)), "radiance transfer", report
     )
@@ -122,7 +119,7 @@ def _bare(volume: Volume) -> Volume:
 
 def as_precomputed(scene: Scene) -> Scene:
     """A scene of the same structure as `precompute` makes of it, at once and with zeros for what it computes: for `jvr.plan`."""
-    if scene.environment is None:
+    if scene.environment_light is None:
         return scene
     order = _material_order(scene)
 
@@ -131,13 +128,13 @@ def as_precomputed(scene: Scene) -> Scene:
         scene = dataclasses.replace(scene, material=scene.material.projected(order))
         if scene.radiance_transfer is None or scene.radiance_transfer.is_frozen:
             return scene.material, None
-        return scene.material, finished(scene, *project_all(_projection(scene)))
+        return scene.material, _finished(scene, *_projection(scene).all_nodes())
 
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(shaped, scene))
     scene = dataclasses.replace(scene, material=zeros[0])
-    if zeros[1] is None:
+    if zeros[1] is None or scene.radiance_transfer is None:
         return scene
-    return dataclasses.replace(scene, radiance_transfer=radiance_transfer_of(scene).with_projected(zeros[1]))
+    return dataclasses.replace(scene, radiance_transfer=scene.radiance_transfer.with_projected(zeros[1]))
 
 
 def _material_order(scene: Scene) -> int:
@@ -145,20 +142,23 @@ def _material_order(scene: Scene) -> int:
     return max(scene.material_order, LEAST_ORDER)
 
 
-def _projection(scene: Scene) -> RadianceTransferProjection:
+def _projection(scene: Scene) -> Any:
     """What the nodes of a scene are projected with."""
-    radiance_transfer = radiance_transfer_of(scene)
+    assert scene.radiance_transfer is not None
     where = occupancy(scene, Settings())
-    return RadianceTransferProjection.of(
-        scene, absorbing(scene, where, scene.transfer.takes_gradient or radiance_transfer.rays_need_gradient)
-    )
+    return scene.radiance_transfer.projection(scene, lambda graded: absorbing(scene, where, graded))
 
 
-def _project(scene: Scene, progress: Progress) -> ProjectedRadianceTransfer:
+def _finished(scene: Scene, *nodes: Array) -> Any:
+    assert scene.radiance_transfer is not None
+    return scene.radiance_transfer.finished(scene, *nodes)
+
+
+def _project(scene: Scene, progress: Progress) -> Any:
     """The radiance transfer of all nodes near which there is something to see, some at a time."""
     projection = jax.jit(_projection)(scene)
     active = np.flatnonzero(np.asarray(projection.active()))
-    shape = jax.eval_shape(project_all, projection)
+    shape = jax.eval_shape(lambda projection: projection.all_nodes(), projection)
     coefficients, around = (np.zeros(x.shape, x.dtype) for x in shape)
     size = shares() * min(TOGETHER, -(-len(active) // shares()))
     for begin in range(0, len(active), size or 1):
@@ -168,11 +168,11 @@ def _project(scene: Scene, progress: Progress) -> ProjectedRadianceTransfer:
         found = _some(projection, jnp.asarray(index, jnp.int32))
         coefficients[index], around[index] = map(np.asarray, found)
         progress((begin + len(piece)) / len(active))
-    return jax.jit(finished)(scene, jnp.asarray(coefficients), jnp.asarray(around))
+    return jax.jit(_finished)(scene, jnp.asarray(coefficients), jnp.asarray(around))
 
 
 @jax.jit
-def _some(projection: RadianceTransferProjection, index: Array) -> tuple[Array, Array]:
+def _some(projection: Any, index: Array) -> tuple[Array, Array]:
     """The radiance transfer of some nodes."""
     return everywhere(over_rays(lambda projection, index: projection.nodes(index), projection, index))
 

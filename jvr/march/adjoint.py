@@ -189,18 +189,18 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangent: M
     active, (k, count) = back.active, back.at(state.j)
     count = occupied_count(medium, active, dt, k, count)
     # The field is not among `small`: it deposits its derivative itself, in place, through the tap.
-    small_mask = is_there((total.medium.transfer, total.medium.shader, total.medium.shadows, state.gradient, total.dt))
-    small, rest = eqx.partition((medium.transfer, medium.shader, medium.shadows, active.rays, dt), small_mask)
+    small_mask = is_there((total.medium.transfer, total.medium.shader, total.medium.visibility, state.gradient, total.dt))
+    small, rest = eqx.partition((medium.transfer, medium.shader, medium.visibility, active.rays, dt), small_mask)
 
     def local(small: Any, taps: tuple[Sample, ...]):
         """The segment as a function of what its derivative is wanted for; the taps stand for the field."""
-        transfer, shader, shadows, rays, dt = eqx.combine(small, rest)
+        transfer, shader, visibility, rays, dt = eqx.combine(small, rest)
         extent, u = segment_span(k, count, rays.length, dt)
         sampled = node_points(medium, rays, active.ray, k, u, extent)
         samples = jax.tree.map(jnp.add, resample(medium, sampled, k < count), taps)
         batch = SegmentBatch(rays, active.ray, k, u, extent, k < count)
         # Light moves with the extinction, of which it knows as the shader does.
-        moved = medium._replace(transfer=transfer, shader=shader, shadows=shadows)
+        moved = medium._replace(transfer=transfer, shader=shader, visibility=visibility)
         samples = with_lighting(moved, batch, samples, reverse=True)
         point = points_at(rays, active.ray, k, u)
         found = jax.vmap(shader.evaluate_segment, in_axes=(None, 0, 0, 0))(transfer, samples, point, extent)
@@ -215,8 +215,8 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangent: M
     # A ray that is done has no derivative, whatever the voxel that it reads.
     on = state.j < back.steps
     small_gradient = (*small_gradient[:3], jax.tree.map(lambda x: jnp.where(on, x, 0.0), small_gradient[3]), small_gradient[4])
-    transfer, shader, shadows, ray_gradient, dt_gradient = jax.tree.map(
-        jnp.add, (total.medium.transfer, total.medium.shader, total.medium.shadows, state.gradient, total.dt), small_gradient
+    transfer, shader, visibility, ray_gradient, dt_gradient = jax.tree.map(
+        jnp.add, (total.medium.transfer, total.medium.shader, total.medium.visibility, state.gradient, total.dt), small_gradient
     )
     # Else the whole computation of the cotangent is repeated in each of the scattered additions, which then take three times as long.
     cotangents = materialise(on, cotangents)
@@ -225,7 +225,7 @@ def _replay_segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangent: M
         field = medium.field.deposit(field, points, of_sample)
     suffix = step_back(state.suffix, front, emitted, dtau, u)
     state = _ReplayState(suffix, state.j + on, ray_gradient)
-    return state, _Gradients(Medium(field, transfer, shader, total.medium.occupancy, shadows), dt_gradient)
+    return state, _Gradients(Medium(field, transfer, shader, total.medium.occupancy, visibility), dt_gradient)
 
 
 def _no_taps(medium: Medium, rays: Rays) -> tuple[Sample, ...]:

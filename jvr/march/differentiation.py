@@ -71,7 +71,7 @@ def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tup
     perturbed = jax.tree.map(lambda t, x: not is_zero(t) and eqx.is_inexact_array(x), tangents, primals, is_leaf=is_zero)
     tangents = eqx.filter(tangents, perturbed)
     medium, rays, dt = primals
-    if jax.tree.leaves(tangents[0].shadows):
+    if jax.tree.leaves(tangents[0].visibility):
         raise ValueError(
             "jvr.Rows() does not know shadows that change, nor a radiance transfer or its light: set "
             "Settings(adjoint=jvr.Replay()), or jvr.Forward() for forward mode; for a transfer function alone, jvr.precompute(scene) "

@@ -105,7 +105,7 @@ def _jacobian_segment(
 
     def radiance_and_depth(classified: Classified) -> tuple[Channels, Channels]:
         # Where in the segment the light is looked up depends on its extinction; the light itself does not.
-        light = {} if medium.shadows is None else {"light": light_at(medium, batch, classified.sigma_t, reverse=True)}
+        light = {} if medium.visibility is None else {"light": light_at(medium, batch, classified.sigma_t, reverse=True)}
         return jax.vmap(medium.shader.shade)(classified, samples._replace(**light), points, extent)
 
     (emitted, dtau), pull = jax.vjp(radiance_and_depth, classified)

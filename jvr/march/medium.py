@@ -5,6 +5,8 @@ into emitted radiance and optical depth, and where the scene asks for it, how mu
 """
 
 import abc
+import functools
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -13,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jvr.march.occupancy import Occupancy
-from jvr.march.steps import Point, Sample
+from jvr.march.steps import Point, Sample, Transmittances
 from jvr.model.transfer import AbstractTable, Classified
 from jvr.types import Channels, Scalar
 
@@ -36,12 +38,11 @@ class AbstractField(eqx.Module):
 
 
 class AbstractVisibility(eqx.Module):
-    """Visibility: how much of each light reaches a point, and of the environment's where the scene asks for it."""
+    """Visibility: how much of the light reaches a point, of what it knows something of: the lights, the environment, ambient light."""
 
     @abc.abstractmethod
-    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> tuple[Channels, ...]:
-        """For each light, the transmittance between it and each of a batch of points, one or three channels, or none where nothing can
-        shade it. What is not `wanted` may be anything finite.
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> Transmittances:
+        """The transmittance between what shines and each of a batch of points. What is not `wanted` may be anything finite.
 
         Differentiable in reverse mode where `reverse` says so, else in forward mode.
         """
@@ -50,6 +51,21 @@ class AbstractVisibility(eqx.Module):
     @abc.abstractmethod
     def stats(self) -> Any:
         """What is to be reported about it, or `None`."""
+
+
+class Visibilities(AbstractVisibility):
+    """Several, each of which knows of other light: what is in the way of lights, and what is in the way of the environment's."""
+
+    each: tuple[AbstractVisibility, ...]
+
+    def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> Transmittances:
+        found = (one.transmittances(points, wanted, reverse=reverse) for one in self.each)
+        return functools.reduce(Transmittances.beside, found)
+
+    @property
+    def stats(self) -> Any:
+        """Of the first that reports something."""
+        return next((one.stats for one in self.each if one.stats is not None), None)
 
 
 class AbstractShader(eqx.Module):
@@ -78,14 +94,18 @@ class AbstractShader(eqx.Module):
 
 
 class Medium(NamedTuple):
-    """What rays march through: resampled, classified, shaded; where `occupancy` is not `None`, only in visible bricks; where `shadows`
-    is not `None`, each sample knows how much light reaches it."""
+    """What rays march through: resampled, classified, shaded; where `occupancy` is not `None`, only in visible bricks; where
+    `visibility` is not `None`, each sample knows how much light reaches it."""
 
     field: AbstractField
     transfer: Any  # what `shader.evaluate_segment` reads: an AbstractTransfer, or one made for the shader
     shader: AbstractShader
     occupancy: Occupancy | None = None
-    shadows: AbstractVisibility | None = None
+    visibility: AbstractVisibility | None = None
+
+
+# What light passes on its way to a point: a medium that emits nothing, with gradients where that is asked for (`True`).
+LightPath = Callable[[bool], Medium]
 
 
 def for_derivatives(medium: Medium, wanted: Medium, moved: Any = None) -> Medium:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.march.medium import DENSEST, Medium
-from jvr.march.steps import Point, Rays, Sample, points_at, segment_count, segment_span
+from jvr.march.steps import Point, Rays, Sample, Transmittances, points_at, segment_count, segment_span
 from jvr.model.transfer import Classified
 from jvr.numerics import materialise, mean_depth
 from jvr.types import Channels, Scalar
@@ -117,7 +117,7 @@ def classify_at(medium: Medium, points: Point, mask: Bool[Array, "points"]) -> t
 
 def with_lighting(medium: Medium, batch: SegmentBatch, samples: tuple[Sample, ...], *, reverse: bool) -> tuple[Sample, ...]:
     """The samples of a segment with the light that reaches it, where that is asked for."""
-    if medium.shadows is None:
+    if medium.visibility is None:
         return samples
     shader, middle = medium.shader, points_at(batch.rays, batch.ray, batch.k, batch.u)
 
@@ -133,13 +133,13 @@ def with_lighting(medium: Medium, batch: SegmentBatch, samples: tuple[Sample, ..
 
 def light_at(
     medium: Medium, batch: SegmentBatch, sigma_t: Sequence[Array], *, reverse: bool, slopes: Sequence[Array] = ()
-) -> tuple[Channels, ...]:
+) -> Transmittances:
     """How much light reaches a segment with these extinctions, and these changes of them with the scalar.
 
     It is looked up where the segment's own emission comes from on average, in front of its middle: in the middle of an opaque one it
     is dark, though its front is not.
     """
-    assert medium.shadows is not None
+    assert medium.visibility is not None
     dtau = jnp.minimum(sum(sigma_t[1:], sigma_t[0]) / len(sigma_t) * batch.extent, DENSEST)
     u = materialise(batch.inside, batch.u + batch.extent * (mean_depth(dtau) - 0.5))
     points = points_at(batch.rays, batch.ray, batch.k, u)
@@ -148,7 +148,7 @@ def light_at(
     everywhere = medium.occupancy is None or len(medium.shader.quadrature_nodes) > 1
     occupied = functools.reduce(jnp.logical_or, [x != 0 for x in (*sigma_t, *slopes)])
     wanted = batch.inside if everywhere else batch.inside & occupied
-    return materialise(batch.inside, medium.shadows.transmittances(points, wanted, reverse=reverse))
+    return materialise(batch.inside, medium.visibility.transmittances(points, wanted, reverse=reverse))
 
 
 def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:

@@ -37,18 +37,39 @@ class Point(NamedTuple):
     k: Int[Array, ""]
 
 
+class Transmittances(NamedTuple):
+    """How much of the light reaches a point: one channel, three, or none where nothing is in its way.
+
+    `lights`: of each light of the scene, or of none where nothing is in the way of any; `environment`: of the environment, as what shows
+    it reads that; `ambient`: of all ambient light.
+    """
+
+    lights: tuple[Channels, ...] = ()
+    environment: Channels = ()
+    ambient: Channels = ()
+
+    def of_light(self, index: int) -> Channels:
+        """That of one of the scene's lights."""
+        return self.lights[index] if self.lights else ()
+
+    def beside(self, other: "Transmittances") -> "Transmittances":
+        """What either says of light of which the other says nothing."""
+        lights, around, ambient = self
+        return Transmittances(lights or other.lights, around or other.environment, ambient or other.ambient)
+
+
 class Sample(NamedTuple):
     """What is resampled at a point; fields that nobody asks for are empty.
 
     `s`: the scalar; `gradient`: its derivatives along the grid axes, or those of the extinction; `neighbours`: what else a gradient is made
-    of, such as scalars around the point before the transfer function; `light`: for each light, the transmittance between it and the point;
-    `known`: 1, or 0 where voxels that it would be made of are missing, in volumes with gaps.
+    of, such as scalars around the point before the transfer function; `light`: how much of it reaches the point; `known`: 1, or 0 where
+    voxels that it would be made of are missing, in volumes with gaps.
     """
 
     s: Float[Array, "..."]
     gradient: Triple = ()
     neighbours: Channels = ()
-    light: tuple[Channels, ...] = ()
+    light: Transmittances = Transmittances()
     known: Channels = ()
 
 

@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 
-from jvr.model.light import AbstractLight
 from jvr.model.parts import AbstractPart, PlanEntry, spelling
 from jvr.names import Renamed
 from jvr.types import Channels, Scalar, Triple
@@ -86,16 +85,15 @@ class AbstractShadows(AbstractPart):
     prepared = Renamed("visibility")
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        casting = sum(isinstance(light, AbstractLight) and light.casts_shadows for light in scene.lights)
+        casting = sum(light is not None for light in scene.shadow_casters)
         return (PlanEntry(name, True, f"{spelling(self)} for {casting} light{'s' * (casting != 1)}", ("light march",)),)
 
     def without(self, scene: Any) -> Any:
         return scene.replaced(shadows=None)
 
     @abc.abstractmethod
-    def visibility(self, scene: Any, lights: tuple[AbstractLight, ...], medium: Any, spacing: Scalar) -> Any:
-        """A `jvr.march.medium.AbstractVisibility` of these lights, made once for a picture; differentiable. `medium`: what light passes
-        through, a `jvr.march.medium.Medium` that emits nothing; `spacing`: world length of the smallest voxel edge."""
+    def visibility(self, scene: Any, path: Any) -> Any:
+        """That of the scene's lights, as `AbstractPart.visibility`."""
 
 
 class AbstractMaterial(AbstractPart):
@@ -135,6 +133,8 @@ class AbstractRadianceTransfer(AbstractPart):
     bleeding: eqx.AbstractVar[Any]
     # Highest order of its harmonics.
     order: eqx.AbstractVar[int]
+    # What scatters light between nodes, or `None`.
+    scattering: eqx.AbstractVar[Any]
 
     outdated, made_for = Renamed("stale"), Renamed("cache_key")
 
@@ -162,6 +162,23 @@ class AbstractRadianceTransfer(AbstractPart):
     @abc.abstractmethod
     def is_final(self) -> bool:
         """Whether a picture has nothing left to do but to multiply it with the light."""
+
+    @abc.abstractmethod
+    def visibility(self, scene: Any, path: Any) -> Any:
+        """That of the scene's environment, as `AbstractPart.visibility`."""
+
+    @abc.abstractmethod
+    def projection(self, scene: Any, path: Any) -> Any:
+        """All that is needed to compute it, a pytree: `active()`, a mask of nodes that are worth it; `nodes(index)`, what some of them are;
+        `all_nodes()`, what all are. `path`: as of `visibility`."""
+
+    @abc.abstractmethod
+    def finished(self, scene: Any, *nodes: Any) -> Any:
+        """What `with_projected` takes, from what all nodes of the scene's projection are."""
+
+    @abc.abstractmethod
+    def with_projected(self, projected: Any) -> "AbstractRadianceTransfer":
+        """The same, computed beforehand."""
 
     @abc.abstractmethod
     def transfer_function(self, scene: Any) -> Any:

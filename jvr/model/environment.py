@@ -10,9 +10,11 @@ from jaxtyping import Array, Float
 
 from jvr.model import harmonics
 from jvr.model.checks import float_array, known, radiances, require
+from jvr.model.exact import Exact
 from jvr.model.harmonics.projection import cap
+from jvr.model.light import AbstractLight
 from jvr.model.parameters import GREY_OR_RGB, TRIPLE, arguments, assign, choice, parameter
-from jvr.model.parts import AbstractPart, PlanEntry, is_zero, spelling
+from jvr.model.parts import PlanEntry, is_zero, spelling
 from jvr.model.ranges import DIRECTION, NOT_NEGATIVE, POSITIVE, RADIANCE, Interval
 from jvr.numerics import normalise
 from jvr.pictures import as_radiance
@@ -29,7 +31,7 @@ def radiance_of_light() -> Any:
     return parameter(RADIANCE, doc="radiance", shapes=GREY_OR_RGB)
 
 
-class EnvironmentLight(AbstractPart):
+class EnvironmentLight(AbstractLight):
     """An environment light: radiance that arrives from direction `d` (pointing away from the scene): `L_i(d) = sum_j c_j Y_j(d)`, the
     same at every point.
 
@@ -47,17 +49,22 @@ class EnvironmentLight(AbstractPart):
         harmonics.order_of(self.coefficients)
 
     def title(self, name: str, scene: Any) -> str:
-        return f"environment and material {spelling(scene.material)}"
+        return f"{name} and material {spelling(scene.material)}" if scene.environment is self else f"{name} {type(self).__name__}"
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         return (PlanEntry(name, True, f"environment lighting, {len(self.coefficients)} coefficients"),)
 
     def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
         if is_zero(self.coefficients):
-            yield "environment has no strength: it is computed and adds nothing"
+            yield f"{name} has no strength: it is computed and adds nothing"
 
     def without(self, scene: Any) -> Any:
-        return scene.replaced(environment=None)
+        if scene.environment is self:
+            return scene.replaced(environment=None)
+        return scene.replaced(lights=tuple(light for light in scene.lights if light is not self))
+
+    def moved(self, origin: Exact) -> "EnvironmentLight":
+        return self
 
     @classmethod
     @arguments(

@@ -48,8 +48,9 @@ class LightSample(NamedTuple):
     irradiance: Triple
 
 
-class AbstractEmitter(AbstractPart):
-    """Whatever a scene may have among its lights."""
+class AbstractLight(AbstractPart):
+    """A light: one that comes from one direction at each point (`AbstractDeltaLight`), or one from all around (`AmbientLight`,
+    `jvr.EnvironmentLight`)."""
 
     def title(self, name: str, scene: Any) -> str:
         return f"{name} {type(self).__name__}"
@@ -65,13 +66,17 @@ class AbstractEmitter(AbstractPart):
         elif not scene.shows_lights:
             yield f"{self.title(name, scene)} is not seen: nothing reflects or scatters it"
 
+    @abc.abstractmethod
+    def moved(self, origin: Exact) -> "AbstractLight":
+        """The same light in a world whose origin is at `origin`."""
+
     def without(self, scene: Any) -> Any:
         shown = scene.shows_lights and len(scene.lights) > 1
         return scene.replaced(lights=tuple(light for light in scene.lights if light is not self)) if shown else None
 
 
-class AbstractLight(AbstractEmitter):
-    """A light that comes from one direction at each point."""
+class AbstractDeltaLight(AbstractLight):
+    """A light that comes from one direction at each point, a delta light."""
 
     # Whether what is between the light and a point can shade it.
     casts_shadows: ClassVar[bool] = True
@@ -82,12 +87,8 @@ class AbstractLight(AbstractEmitter):
     def sample(self, x: Triple, w_o: Triple) -> LightSample:
         """Light at world position `x`, which is looked at from the unit direction `w_o` (to the eye)."""
 
-    @abc.abstractmethod
-    def moved(self, origin: Exact) -> "AbstractLight":
-        """The same light in a world whose origin is at `origin`."""
 
-
-class DirectionalLight(AbstractLight):
+class DirectionalLight(AbstractDeltaLight):
     """Directional light: parallel, as from the sun.
 
     **Arguments:** `direction`: `(3,)`, the way the light travels, of any length but zero; `irradiance`: a number or `(3,)`, not negative.
@@ -107,7 +108,7 @@ class DirectionalLight(AbstractLight):
         return self
 
 
-class PointLight(AbstractLight):
+class PointLight(AbstractDeltaLight):
     """A point that shines in all directions. Irradiance at distance `r` is `intensity / max(r, radius)^2`, or with
     `attenuation = (c, l, q)` `intensity / (c + l r + q r^2)`.
 
@@ -143,7 +144,7 @@ class PointLight(AbstractLight):
         return _at(self, origin)
 
 
-class SpotLight(AbstractLight):
+class SpotLight(AbstractDeltaLight):
     """A point that shines into a cone: full intensity up to the half-angle `inner` from its axis, none beyond `outer`, smooth in between
     (a cubic in the cosine).
 
@@ -193,7 +194,7 @@ class SpotLight(AbstractLight):
         return _at(self, origin)
 
 
-class HeadLight(AbstractLight):
+class HeadLight(AbstractDeltaLight):
     """A headlight: light that comes from the eye along each ray; it casts no shadows. `irradiance`: a number or `(3,)`, not negative."""
 
     casts_shadows: ClassVar[bool] = False
@@ -210,10 +211,12 @@ class HeadLight(AbstractLight):
         return self
 
 
-class AmbientLight(AbstractEmitter):
-    """Ambient light: the same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative."""
+class AmbientLight(AbstractLight):
+    """Ambient light: the same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative.
 
-    casts_shadows: ClassVar[bool] = False
+    It is shown by `Scene(shading=...)` and `Scene(scattering=...)`; materials show `jvr.EnvironmentLight.constant(radiance)`, which is the
+    same light.
+    """
 
     radiance: Float[Array, "..."] = brightness("radiance")
 
@@ -225,6 +228,9 @@ class AmbientLight(AbstractEmitter):
         reflects = scene.shading is not None and not is_zero(scene.shading.ambient_reflectance())
         if scene.shows_lights and scene.scattering is None and not reflects:
             yield f"{self.title(name, scene)} is not seen: shading.ambient is zero"
+
+    def moved(self, origin: Exact) -> "AmbientLight":
+        return self
 
     @property
     def rgb(self) -> Triple:

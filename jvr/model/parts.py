@@ -49,7 +49,7 @@ class Knob(NamedTuple):
 
 class AbstractPart(eqx.Module):
     """A part of a scene or of settings. Whatever it does not say otherwise: it is in the program where it is in the scene, shows no light,
-    asks for no gradient, is worth no remark, cannot be left out and has no knobs."""
+    asks for no gradient, is in the way of no light, is worth no remark, cannot be left out and has no knobs."""
 
     @property
     def needs_gradient(self) -> bool:
@@ -77,6 +77,11 @@ class AbstractPart(eqx.Module):
     def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
         """What of it does not show, and what a picture's `jvr.RenderStats` (or `None`) have to report of it; of concrete arrays."""
         yield from ()
+
+    def visibility(self, scene: Any, path: Any) -> Any:
+        """A `jvr.march.medium.AbstractVisibility` of the light that it is in the way of, made once for all rays of a picture, or `None`;
+        differentiable. `path`: a `jvr.march.medium.LightPath` through the scene that holds it."""
+        return None
 
     def without(self, scene: Any) -> Any:
         """The scene without it, or `None` where a scene cannot do without."""

@@ -1,6 +1,7 @@
 """The scene: a volume and everything that says how it looks."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -9,7 +10,7 @@ import equinox as eqx
 from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer, AbstractScattering, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
-from jvr.model.light import AbstractEmitter, AbstractLight
+from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
 from jvr.model.parameters import assign, parameter
@@ -30,12 +31,13 @@ class Scene(AbstractPart):
     - `background`: `(3,)` linear RGB that shows through what is transparent, or `None`.
     - `optical`: `jvr.EmissionAbsorption()` (default), `jvr.EmissionOnly()` or `jvr.AbsorptionOnly()`.
     - `clipping`: `jvr.ClippingBox` or `None`.
-    - `lights`: any number of `jvr.DirectionalLight`, `jvr.PointLight`, `jvr.SpotLight`, `jvr.HeadLight` and `jvr.AmbientLight`.
+    - `lights`: any number of `jvr.DirectionalLight`, `jvr.PointLight`, `jvr.SpotLight`, `jvr.HeadLight`, `jvr.AmbientLight` and
+      `jvr.EnvironmentLight`.
     - `shading`: what surfaces make of light: `jvr.Lambert`, `jvr.Phong`, `jvr.BlinnPhong`, or `None`: the medium glows as it is.
     - `shadows`: how much of each light reaches a point: `jvr.ShadowRays`, `jvr.ShadowVolume`, `jvr.ShadowMap`, `jvr.OpacityShadowMap`,
       `jvr.DeepShadowMap`, or `None`: all of it.
     - `scattering`: what the medium makes of light: `jvr.SingleScattering` or `None`.
-    - `environment`: light from far away in all directions: `jvr.EnvironmentLight` or `None`.
+    - `environment`: light from far away in all directions: `jvr.EnvironmentLight` or `None`; adds to those among `lights`.
     - `material`: what a point makes of the environment's light: a BRDF such as `jvr.MicrofacetBRDF(...)`, `jvr.HarmonicMaterial`,
       `jvr.MaterialByValue`, or `None`.
     - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
@@ -51,7 +53,7 @@ class Scene(AbstractPart):
     background: Vector | None = parameter(COLOUR, doc="red, green, blue, linear")
     optical: AbstractOpticalModel = parameter(doc="one of jvr's")
     clipping: ClippingBox | None = parameter(doc="a jvr.ClippingBox")
-    lights: tuple[AbstractEmitter, ...] = parameter(doc="a sequence of jvr's lights")
+    lights: tuple[AbstractLight, ...] = parameter(doc="a sequence of jvr's lights")
     shading: AbstractShading | None = parameter(doc="one of jvr's")
     shadows: AbstractShadows | None = parameter(doc="one of jvr's")
     scattering: AbstractScattering | None = parameter(doc="one of jvr's")
@@ -68,7 +70,7 @@ class Scene(AbstractPart):
         background: ArrayLike | None = None,
         optical: AbstractOpticalModel = EmissionAbsorption(),
         clipping: ClippingBox | None = None,
-        lights: Sequence[AbstractEmitter] = (),
+        lights: Sequence[AbstractLight] = (),
         shading: AbstractShading | None = None,
         shadows: AbstractShadows | None = None,
         scattering: AbstractScattering | None = None,
@@ -102,6 +104,21 @@ class Scene(AbstractPart):
         return self.shows_lights or any(part.shows_environment for _, part in parts_of(self))
 
     @property
+    def environment_lights(self) -> tuple[EnvironmentLight, ...]:
+        """Its environment and those among its lights."""
+        return _environments(self.lights, self.environment)
+
+    @property
+    def environment_light(self) -> EnvironmentLight | None:
+        """The light of all of them as one, or `None` where there is none."""
+        return functools.reduce(EnvironmentLight.__add__, self.environment_lights) if self.environment_lights else None
+
+    @property
+    def shadow_casters(self) -> tuple[AbstractDeltaLight | None, ...]:
+        """Its lights, `None` in the place of each that nothing shades."""
+        return _casters(self.lights)
+
+    @property
     def needs_gradient(self) -> bool:
         return any(part.needs_gradient for _, part in parts_of(self))
 
@@ -116,16 +133,17 @@ class Scene(AbstractPart):
         """The scene with other parts, and without what these cannot carry: shadows go with the last light that casts them and the last part
         that shows them, the material and the radiance transfer with the environment."""
         light, shading, scattering = (parts.get(name, getattr(self, name)) for name in ("lights", "shading", "scattering"))
-        if not any(isinstance(x, AbstractLight) and x.casts_shadows for x in light) or (shading is None and scattering is None):
+        if not any(_casters(light)) or (shading is None and scattering is None):
             parts["shadows"] = None
-        if parts.get("environment", self.environment) is None:
-            parts |= {"environment": None, "material": None, "radiance_transfer": None}
+        if not _environments(light, parts.get("environment", self.environment)):
+            parts |= {"material": None, "radiance_transfer": None}
         return dataclasses.replace(self, **parts)
 
     @property
     def material_order(self) -> int:
         """`material_order` of its environment and radiance transfer; 0 without an environment."""
-        return 0 if self.environment is None else material_order(self.environment, self.radiance_transfer)
+        around = self.environment_light
+        return 0 if around is None else material_order(around, self.radiance_transfer)
 
 
 def material_order(environment: EnvironmentLight, transfer: AbstractRadianceTransfer | None) -> int:
@@ -136,9 +154,20 @@ def material_order(environment: EnvironmentLight, transfer: AbstractRadianceTran
     return max(environment.order, transfer.order)
 
 
+def _casters(lights: Sequence[AbstractLight]) -> tuple[AbstractDeltaLight | None, ...]:
+    return tuple(light if isinstance(light, AbstractDeltaLight) and light.casts_shadows else None for light in lights)
+
+
+def _environments(lights: Sequence[AbstractLight], environment: EnvironmentLight | None) -> tuple[EnvironmentLight, ...]:
+    return tuple(light for light in (environment, *lights) if isinstance(light, EnvironmentLight))
+
+
 def _check_light(scene: Scene) -> None:
     """Parts of the light that go together."""
-    if scene.shadows is not None and not any(isinstance(light, AbstractLight) and light.casts_shadows for light in scene.lights):
+    for light in scene.lights:
+        if not isinstance(light, AbstractDeltaLight | AmbientLight | EnvironmentLight):
+            raise TypeError(f"nothing shows a {type(light).__name__}: derive it from jvr.model.light.AbstractDeltaLight")
+    if scene.shadows is not None and not any(scene.shadow_casters):
         raise ValueError(
             "there are shadows and no light that casts them: add a jvr.DirectionalLight to lights=, or leave shadows out"
         )
@@ -148,9 +177,9 @@ def _check_light(scene: Scene) -> None:
 
 def _check_environment(scene: Scene) -> None:
     """Environment lighting, and what shows it."""
-    if scene.environment is not None and scene.material is None:
+    if scene.environment_lights and scene.material is None:
         raise ValueError("nothing shows the environment: set material=jvr.LambertBRDF() or another material")
-    if scene.material is not None and scene.environment is None:
+    if scene.material is not None and not scene.environment_lights:
         raise ValueError("a material shows environment lighting: set environment=jvr.EnvironmentLight.from_image(...)")
-    if scene.radiance_transfer is not None and scene.environment is None:
+    if scene.radiance_transfer is not None and not scene.environment_lights:
         raise ValueError("radiance transfer is that of an environment: set environment= and material=, or leave it out")

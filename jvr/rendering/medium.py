@@ -1,10 +1,11 @@
 """From a scene to the medium that rays march through: what the scene does not name is not in it.
 
-Modules of effects are imported here and only for scenes that hold them; everything else about them is behind the interfaces of
-`jvr.model.effects`.
+Effects are behind the interfaces of `jvr.model.parts` and `jvr.model.effects`. What shows light in a scene comes together in one module,
+which is imported for scenes alone that show any.
 """
 
 import dataclasses
+import importlib
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import equinox as eqx
@@ -13,14 +14,14 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from jvr.march.fields import VoxelField
-from jvr.march.medium import DENSEST, AbstractShader, AbstractVisibility, Medium
+from jvr.march.medium import DENSEST, AbstractVisibility, Medium, Visibilities
 from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.quadrature import PreIntegrated
 from jvr.march.shaders import GradientFrame, LightPathShader, OpticalShader, PreIntegratedShader
 from jvr.model.bricks import bricks_of
-from jvr.model.light import AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbsorptionOnly
+from jvr.model.parts import parts_of
 from jvr.model.preintegration import PreIntegratedTable
 from jvr.model.scene import Scene
 from jvr.types import Scalar
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     # Settings hold an integrator, which reads what is prepared.
     from jvr.rendering.settings import Settings
 
+LIGHTING = "jvr.effects.lighting"
+
 
 class Prepared(NamedTuple):
     """What all rays through a scene share, computed once.
@@ -36,20 +39,20 @@ class Prepared(NamedTuple):
     - `scene`: near its volume (`jvr.rendering.trace.near_volume`);
     - `settings`: how it is rendered, all but the step, which is 1 here;
     - `dt`: the world length of a segment;
-    - `occupancy`, `shadows`, `environment`: visible bricks, what is in the way of light, and the material under environment lighting,
-      each `None` where the scene asks for none.
+    - `occupancy`, `visibility`, `lighting`: visible bricks, what is in the way of light, and what the shader of light computes for all
+      rays, each `None` where the scene asks for none.
     """
 
     scene: Scene
     settings: "Settings"
     dt: Scalar
     occupancy: Occupancy | None = None
-    shadows: AbstractVisibility | None = None
-    environment: Any = None
+    visibility: AbstractVisibility | None = None
+    lighting: Any = None
 
     @property
     def shadow_stats(self) -> Any:
-        return None if self.shadows is None else self.shadows.stats
+        return None if self.visibility is None else self.visibility.stats
 
 
 def prepare(
@@ -63,8 +66,9 @@ def prepare(
     """What rays through a scene near its volume need to know beforehand. `skips`: whether they skip empty bricks; `visible`: how much light
     reaches a point, where that is known."""
     occupied = occupancy(scene, settings) if skips else None
-    shadows = visibility(scene, occupied) if visible is None else visible
-    return Prepared(scene, dataclasses.replace(settings, step=1.0), dt, occupied, shadows, environment(scene))
+    visible = visibility(scene, occupied) if visible is None else visible
+    lighting = _lighting().prepare(scene) if scene.shows_light else None
+    return Prepared(scene, dataclasses.replace(settings, step=1.0), dt, occupied, visible, lighting)
 
 
 def medium(prepared: Prepared) -> Medium:
@@ -75,27 +79,18 @@ def medium(prepared: Prepared) -> Medium:
     quadrature = settings.quadrature
     pre_integrated = quadrature.pre_integrates
     if scene.shows_light:
-        shader = _lit_shader(scene, frame, pre_integrated, prepared.environment)
+        shader = _lighting().lit_shader(scene, frame, prepared.lighting, pre_integrated=pre_integrated)
     else:
         shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
     if not isinstance(quadrature, PreIntegrated):
-        return Medium(field, scene.transfer, shader, prepared.occupancy, prepared.shadows)
+        return Medium(field, scene.transfer, shader, prepared.occupancy, prepared.visibility)
     # Checks the transfer function's type itself.
     table = PreIntegratedTable(cast(Any, scene.transfer), quadrature.parts)
-    return Medium(field, table, shader, prepared.occupancy, prepared.shadows)
+    return Medium(field, table, shader, prepared.occupancy, prepared.visibility)
 
 
-def _lit_shader(scene: Scene, frame: GradientFrame | None, pre_integrated: bool, environment: Any) -> AbstractShader:
-    from jvr.effects.cut import CutFaces
-    from jvr.effects.lighting import LitPreIntegratedShader, LitShader
-
-    kind = LitPreIntegratedShader if pre_integrated else LitShader
-    ambient = tuple(light for light in scene.lights if isinstance(light, AmbientLight))
-    lights, volume = delta_lights(scene), scene.volume
-    cut = None
-    if scene.clipping is not None and frame is not None:
-        cut = CutFaces(scene.clipping, jnp.min(volume.spacing))
-    return kind(scene.optical, frame, volume.world_from_grid, lights, ambient, scene.shading, scene.scattering, cut, environment)
+def _lighting() -> Any:
+    return importlib.import_module(LIGHTING)
 
 
 def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
@@ -110,25 +105,11 @@ def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | No
     return GradientFrame(eqx.filter(normals, False), volume.axes_inverse, volume.intercept, volume.shape), normals
 
 
-def delta_lights(scene: Scene) -> tuple[AbstractLight, ...]:
-    """The lights that come from one direction at each point (delta lights)."""
-    return tuple(light for light in scene.lights if isinstance(light, AbstractLight))
-
-
 def visibility(scene: Scene, occupancy: Occupancy | None) -> AbstractVisibility | None:
     """What says how much light reaches a point, or `None` where nothing is in its way. Made once for a picture."""
-    if scene.shadows is None and scene.radiance_transfer is None:
-        return None
-    shadows = None
-    if scene.shadows is not None:
-        medium = absorbing(scene, occupancy, scene.transfer.takes_gradient)
-        shadows = scene.shadows.visibility(scene, delta_lights(scene), medium, jnp.min(scene.volume.spacing))
-    if scene.radiance_transfer is None:
-        return shadows
-    from jvr.effects.radiance_transfer_grid import radiance_transfer_visibility
-
-    medium = absorbing(scene, occupancy, scene.transfer.takes_gradient or scene.radiance_transfer.rays_need_gradient)
-    return radiance_transfer_visibility(scene, medium, shadows, len(delta_lights(scene)))
+    path = lambda graded: absorbing(scene, occupancy, graded)
+    found = [each for _, part in parts_of(scene) if (each := part.visibility(scene, path)) is not None]
+    return Visibilities(tuple(found)) if len(found) > 1 else next(iter(found), None)
 
 
 def absorbing(scene: Scene, occupancy: Occupancy | None, graded: bool) -> Medium:
@@ -136,15 +117,6 @@ def absorbing(scene: Scene, occupancy: Occupancy | None, graded: bool) -> Medium
     frame, normals = _gradients(scene) if graded else (None, None)
     shader = LightPathShader(AbsorptionOnly(), frame, DENSEST / jnp.min(scene.volume.spacing))
     return Medium(VoxelField(scene.volume, normals), scene.transfer, shader, occupancy)
-
-
-def environment(scene: Scene) -> Any:
-    """The material under environment lighting, or `None` without one. Made once for a picture."""
-    if scene.material is None:
-        return None
-    from jvr.effects.environment_lighting import environment_lighting_of
-
-    return environment_lighting_of(scene)
 
 
 def occupancy(scene: Scene, settings: "Settings") -> Occupancy | None:

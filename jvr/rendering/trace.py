@@ -10,7 +10,6 @@ from jaxtyping import Array, Float, Int
 from jvr.march.march import Marched
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
-from jvr.model.light import AbstractLight
 from jvr.model.scene import Scene
 from jvr.numerics import larger, one_minus_exp, ray_box, smaller
 from jvr.types import Scalar, Triple
@@ -39,7 +38,7 @@ def near_volume(scene: Scene, *others: Any) -> Any:
     scene, *cameras = promote_dtypes(scene, *others)
     origin = jax.lax.stop_gradient(scene.volume.origin)
     placed = lambda s: (s.volume, s.clipping, s.lights)
-    lights = tuple(light.moved(origin) if isinstance(light, AbstractLight) else light for light in scene.lights)
+    lights = tuple(light.moved(origin) for light in scene.lights)
     clipping = None if scene.clipping is None else scene.clipping.moved(origin)
     parts = (scene.volume.moved(origin), clipping, lights)
     scene = eqx.tree_at(placed, scene, parts, is_leaf=lambda x: x is None)

@@ -46,6 +46,18 @@ def transfer_at(scene):
     )(scene)
 
 
+def test_environment_lights_among_the_lights_add_up():
+    """Each has coefficients of its own; together they are their sum, and ask for what shows them."""
+    probe, lamp = light(), light(order=2, seed=5)
+    apart = scene(environment=probe, lights=(lamp,))
+    np.testing.assert_allclose(picture(apart), picture(scene(environment=probe + lamp)), rtol=1e-6, atol=1e-7)
+    assert [x.coefficients.shape[0] for x in apart.environment_lights] == [16, 9]
+    assert apart.replaced(environment=None).material is not None
+    assert apart.replaced(environment=None, lights=()).material is None
+    with pytest.raises(ValueError, match="nothing shows the environment"):
+        jvr.Scene(apart.volume, apart.transfer, lights=(lamp,))
+
+
 # --- light -----------------------------------------------------------------------------------------------------------
 
 

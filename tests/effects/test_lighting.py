@@ -9,6 +9,10 @@ import pytest
 from scenes import OBLIQUE, linear_transfer, perspective, render, rotation, voxels
 
 import jvr
+from jvr.march.medium import AbstractVisibility
+from jvr.march.steps import Transmittances
+from jvr.model.effects import AbstractShadows
+from jvr.model.light import AbstractLight
 
 LENGTH, SIGMA = 8.0, 0.3
 COLOUR = np.array([0.9, 0.5, 0.2])
@@ -520,3 +524,51 @@ def test_opaque_segments_are_lit_where_their_emission_comes_from(sigma, least):
     truth = -np.expm1(-14 * sigma) / (8 * np.pi)
     assert np.all(radiance >= least * truth)
     assert np.all(radiance <= truth * (1 + 1e-5))
+
+
+class Fractions(AbstractVisibility):
+    """Says of the first and the last of three lights, of the environment and of ambient light what fraction of them arrives."""
+
+    def transmittances(self, points, wanted, *, reverse):
+        fraction = lambda value: (jnp.full(wanted.shape, value),)
+        return Transmittances((fraction(0.5), (), fraction(0.25)), environment=fraction(0.75), ambient=fraction(0.125))
+
+    @property
+    def stats(self):
+        return None
+
+
+class FractionalShadows(AbstractShadows):
+    def visibility(self, scene, path):
+        return Fractions()
+
+
+def test_each_light_has_a_slot_of_visibility():
+    """What arrives of a light dims that light alone, wherever ambient light stands among others: pictures are linear in lights."""
+
+    def picture(first, ambient, last, around, shadows=None):
+        volume = jvr.Volume(voxels(), OBLIQUE)
+        lights = (jvr.DirectionalLight((0.3, 0.5, -0.8), first), jvr.AmbientLight(ambient), jvr.HeadLight(last))
+        environment = {"environment": jvr.EnvironmentLight.constant(around), "material": jvr.LambertBRDF(0.5)}
+        shading = jvr.Lambert(0.3, 0.6)
+        scene = jvr.Scene(volume, linear_transfer(), lights=lights, shading=shading, shadows=shadows, **environment)
+        return np.asarray(render(scene, perspective(volume)).rgb)
+
+    found = picture(1.0, 1.0, 1.0, 1.0, FractionalShadows())
+    np.testing.assert_allclose(found, picture(0.5, 0.125, 0.25, 0.75), rtol=1e-5, atol=1e-6)
+    assert np.max(np.abs(found - picture(0.5, 0.25, 0.125, 0.75))) > 1e-3
+
+
+class Lantern(AbstractLight):
+    """A light that says nothing of what arrives."""
+
+    def moved(self, origin):
+        return self
+
+
+def test_lights_are_one_family():
+    """All are moved with the world; one that nothing could show is refused."""
+    for light in (jvr.DirectionalLight((1, 0, 0)), jvr.AmbientLight(), jvr.HeadLight(), jvr.EnvironmentLight.constant()):
+        assert isinstance(light, AbstractLight)
+    with pytest.raises(TypeError, match=r"nothing shows a Lantern: derive it from jvr\.model\.light\.AbstractDeltaLight"):
+        jvr.Scene(slab(), medium(), lights=(Lantern(),), shading=jvr.Lambert())

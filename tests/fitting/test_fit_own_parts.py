@@ -15,7 +15,7 @@ from jvr.fitting.observations import observe
 from jvr.fitting.problem import Problem
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 from jvr.model.effects import AbstractMaterial
-from jvr.model.light import AbstractLight, LightSample
+from jvr.model.light import AbstractDeltaLight, LightSample
 from jvr.model.parameters import parameter
 from jvr.model.ranges import DIRECTION, INCREASING, NOT_NEGATIVE, UNIT_INTERVAL
 from jvr.model.transfer import AbstractTable, Classified
@@ -45,7 +45,7 @@ class SquareRoots(AbstractTable):
         return Classified((r, g, b), (weights @ self.sigma_t,))
 
 
-class Sun(AbstractLight):
+class Sun(AbstractDeltaLight):
     """Parallel light."""
 
     heading: Float[Array, "3"] = parameter(DIRECTION, doc="direction")

@@ -20,7 +20,7 @@ from jvr.io.config.schema.parts import table_of
 from jvr.io.kinds import KINDS, PARTS
 from jvr.io.reference import markdown, public_parameters
 from jvr.model.exact import Exact
-from jvr.model.light import AbstractEmitter, AbstractLight, LightSample
+from jvr.model.light import AbstractDeltaLight, AbstractLight, LightSample
 from jvr.model.parameters import GREY_OR_RGB, alternatives, assign, choice, declared, parameter, parts_of, range_at
 from jvr.model.phase import AbstractPhase, ScatteringAngle, components
 from jvr.model.ranges import ANY, RADIANCE, Interval
@@ -29,7 +29,7 @@ from jvr.types import ArrayLike, Channels, Scalar, Triple, Vector
 # --- Classes of a contributor ----------------------------------------------------------------------------------------
 
 
-class LampLight(AbstractLight):
+class LampLight(AbstractDeltaLight):
     """A light of a user: far away, stronger or weaker than it says."""
 
     direction: Vector = parameter(doc="x, y, z, the way that the light travels")
@@ -74,7 +74,7 @@ def _registered():
     jvr.register("lamp", LampLight)
     jvr.register("linear", LinearPhase)
     yield
-    for family, kind, name in ((AbstractEmitter, "lamp", "LampLight"), (AbstractPhase, "linear", "LinearPhase")):
+    for family, kind, name in ((AbstractLight, "lamp", "LampLight"), (AbstractPhase, "linear", "LinearPhase")):
         del KINDS[family][kind], PARTS[name]
 
 
@@ -175,7 +175,7 @@ def test_a_contributors_parameters_are_fitted_in_their_range(bounds):
 
 
 def test_only_families_and_free_names_are_registered():
-    with pytest.raises(TypeError, match=r"Volume is none of AbstractEmitter, .*, which files can name"):
+    with pytest.raises(TypeError, match=r"Volume is none of AbstractLight, .*, which files can name"):
         jvr.register("grid", jvr.Volume)
     with pytest.raises(ValueError, match="'point' or the name LampLight is that of another class"):
         jvr.register("point", LampLight)
@@ -266,7 +266,7 @@ UNDECLARED = {
 }
 # Where a configuration says a part of a family.
 PLACES = {
-    "AbstractEmitter": "lights",
+    "AbstractLight": "lights",
     "AbstractShading": "shading",
     "AbstractShadows": "shadows",
     "AbstractScattering": "scattering",

@@ -44,7 +44,7 @@ def environment_parts(config: Config) -> dict[str, Any]:
 
 def precomputed(scene: Scene, **keywords: Any) -> Scene:
     """`jvr.precompute`, which is imported for scenes alone that have environment lighting."""
-    if scene.environment is None:
+    if scene.environment_light is None:
         return scene
     from jvr.io.precompute import precompute
 

@@ -14,7 +14,7 @@ from jvr.io.config.schema.parts import WRITTEN, KindTable, part
 from jvr.io.config.schema.table import Length, Position, one_or_more
 from jvr.io.kinds import KINDS
 from jvr.model.effects import AbstractScattering, AbstractShading, AbstractShadows
-from jvr.model.light import AbstractEmitter
+from jvr.model.light import AbstractLight
 from jvr.model.normals import AbstractNormals
 from jvr.model.phase import AbstractPhase
 from jvr.model.ranges import AT_LEAST_ONE, DIRECTION, NOT_NEGATIVE
@@ -56,7 +56,7 @@ class DiscTable(AreaTable):
         return disc_light(**keywords, key=jax.random.key(seed))
 
 
-WRITTEN[AbstractEmitter] = {"sphere": SphereTable, "disc": DiscTable}
+WRITTEN[AbstractLight] = {"sphere": SphereTable, "disc": DiscTable}
 
 
 def _from_0_to_180(value: list[float]) -> list[float]:
@@ -101,7 +101,7 @@ def _one_method(value: Any) -> Any:
     return value
 
 
-Lights = Annotated[list[Annotated[Any, part(AbstractEmitter)]], BeforeValidator(one_or_more), Field(validate_default=True)]
+Lights = Annotated[list[Annotated[Any, part(AbstractLight)]], BeforeValidator(one_or_more), Field(validate_default=True)]
 Shading = Annotated[Any, part(AbstractShading)]
 Shadows = Annotated[Any, part(AbstractShadows), BeforeValidator(_one_method)]
 Scattering = Annotated[Any, part(AbstractScattering, "single")]
