@@ -10,9 +10,8 @@ from typing import Any
 
 import equinox as eqx
 
-import jvr
-from jvr.io.kinds import KINDS
-from jvr.io.reference import markdown, parameters_of
+from jvr.io.reference import kinds_of, markdown, parameters_of
+from jvr.io.reference import public as public_names
 from jvr.names import NAMES
 
 # Parts of the package, with the titles of their pages.
@@ -57,7 +56,7 @@ def section(module: str) -> str:
 
 def public() -> dict[str, Any]:
     """Every public class and function by the name that users call it by."""
-    found = {f"jvr.{name}": getattr(jvr, name) for names in NAMES.values() for name in names}
+    found = {f"jvr.{name}": thing for name, thing in public_names().items()}
     for name, module in MODULES.items():
         functions = inspect.getmembers(importlib.import_module(module), inspect.isfunction)
         found |= {
@@ -75,24 +74,20 @@ def home(name: str) -> str:
 def entry(name: str, thing: Any) -> str:
     """A class with its methods, or a function."""
     if not inspect.isclass(thing):
-        return directive("function", name + signature(thing), text_of(thing))
+        return directive("function", name + signature(thing), whole_text_of(thing))
     if issubclass(thing, enum.Enum):
         return directive("class", name, f"{text_of(thing)} One of {', '.join(f'`{value}`' for value in thing.__members__)}.")
-    body = [text_of(thing), *(f'In a configuration `kind = "{kind}"`.' for kind in kinds_of(thing)), table_of(thing)]
+    body = [whole_text_of(thing) if issubclass(thing, eqx.Module) else text_of(thing)]
     for method, kind, function in methods(thing):
-        body.append(directive(kind, method + ("" if kind == "property" else signature(function)), text_of(function)))
+        found = text_of(function) if kind == "property" else whole_text_of(getattr(thing, method))
+        body.append(directive(kind, method + ("" if kind == "property" else signature(function)), found))
     return directive("class", name + signature(thing), "\n\n".join(body), ":::::")
 
 
-def table_of(cls: type) -> str:
-    """The parameters that a class declares."""
-    entries = parameters_of(cls) if issubclass(cls, eqx.Module) else ()
-    return markdown(entries) if entries else ""
-
-
-def kinds_of(cls: type) -> list[str]:
-    """What configurations call a class."""
-    return [kind for names in KINDS.values() for kind, name in names.items() if name == cls.__name__]
+def whole_text_of(thing: Any) -> str:
+    """What the text of a class or function says, what configurations call it, and a table of the parameters that it declares."""
+    kinds = (f'In a configuration `kind = "{kind}"`.' for kind in kinds_of(thing))
+    return "\n\n".join(part for part in (text_of(thing), *kinds, markdown(parameters_of(thing))) if part)
 
 
 def directive(kind: str, head: str, body: str, fence: str = "::::") -> str:

@@ -1,4 +1,4 @@
-"""The parameters of public classes, as data and as Markdown, from what the classes declare."""
+"""The parameters of public classes and functions, as data and as Markdown, from what they declare."""
 
 import dataclasses
 import functools
@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 
+from jvr.io.kinds import KINDS, maker_of
 from jvr.model.parameters import Parameter, alternatives, declared, parts_of, shapes_of
 from jvr.model.ranges import ANY
 from jvr.names import NAMES
@@ -37,23 +38,36 @@ def parameters_of(thing: Any) -> tuple[Entry, ...]:
 
 
 def public_parameters() -> dict[str, tuple[Entry, ...]]:
-    """The parameters of every public class that has some, by the name of the class."""
-    return {name: parameters_of(cls) for name, cls in _public_classes().items() if parameters_of(cls)}
+    """The parameters of every public class and function that declares some, by its name."""
+    found = {name: parameters_of(thing) for name, thing in sorted(public().items()) if _declares(thing)}
+    return {name: entries for name, entries in found.items() if entries}
+
+
+def _declares(thing: Any) -> bool:
+    return issubclass(thing, eqx.Module) if inspect.isclass(thing) else bool(declared(thing))
 
 
 def _is_public(part: type) -> bool:
     """Whether some public class is a part of this kind."""
-    return any(issubclass(cls, part) for cls in _public_classes().values())
+    return any(issubclass(thing, part) for thing in public().values() if inspect.isclass(thing))
 
 
 @functools.cache
-def _public_classes() -> dict[str, type]:
-    things = {name: getattr(importlib.import_module(module), name) for module, names in NAMES.items() for name in names}
-    return {name: cls for name, cls in sorted(things.items()) if inspect.isclass(cls) and issubclass(cls, eqx.Module)}
+def public() -> dict[str, Any]:
+    """Every public name of `jvr` but modules, and what it names."""
+    return {name: getattr(importlib.import_module(module), name) for module, names in NAMES.items() for name in names}
+
+
+def kinds_of(thing: Any) -> tuple[str, ...]:
+    """What configurations call a class or function."""
+    named = ((kind, maker_of(family, kind)) for family, kinds in KINDS.items() for kind in kinds)
+    return tuple(kind for kind, maker in named if maker == thing)
 
 
 def markdown(entries: tuple[Entry, ...]) -> str:
-    """A table of parameters."""
+    """A table of parameters; nothing where there are none."""
+    if not entries:
+        return ""
     lines = ["| parameter | what | shape | values | default |", "|---|---|---|---|---|"]
     for e in entries:
         about = Parameter(ANY, e.doc, e.unit, e.hint).about
