@@ -84,27 +84,25 @@ class LitShader(OpticalShader):
         glows = shading is None and self.environment is None
         factor, added = [zero + 1 if glows else zero] * 3, [zero] * 3
         for i, light in enumerate(self.lights):
-            if not isinstance(light, AbstractDeltaLight):
+            if isinstance(light, AbstractDeltaLight):
+                w_i, _, irradiance = light.sample(x, w_o)
+                incident = _times(irradiance, sample.light.of_light(i))
+                reflected = None if shading is None else shading.reflect(surface, normal, w_o, w_i)
+                scattered = None if scattering is None else scattering.scatter(w_o, w_i)
+            elif isinstance(light, AmbientLight):
+                incident = _times(light.rgb, sample.light.ambient)
+                reflected = None if shading is None else (shading.ambient_reflectance(), None)
+                scattered = None if scattering is None else scattering.scatter_ambient()
+            else:
+                # Light of the environment is shown by the material, all of it together.
                 continue
-            w_i, _, irradiance = light.sample(x, w_o)
-            incident = _times(irradiance, sample.light.of_light(i))
-            if shading is not None:
-                diffuse, specular = shading.reflect(surface, normal, w_o, w_i)
+            if reflected is not None:
+                diffuse, specular = reflected
                 factor = [f + reflects * diffuse * e for f, e in zip(factor, incident, strict=True)]
                 if specular is not None:
                     added = [b + reflects * specular * e for b, e in zip(added, incident, strict=True)]
-            if scattering is not None:
-                scattered = _times(incident, scattering.scatter(w_o, w_i))
-                added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
-        for light in self.lights:
-            if not isinstance(light, AmbientLight):
-                continue
-            incident = _times(light.rgb, sample.light.ambient)
-            if shading is not None:
-                factor = [f + reflects * shading.ambient_reflectance() * e for f, e in zip(factor, incident, strict=True)]
-            if scattering is not None:
-                scattered = _times(incident, scattering.scatter_ambient())
-                added = [b + scatters * e for b, e in zip(added, scattered, strict=True)]
+            if scattered is not None:
+                added = [b + scatters * e for b, e in zip(added, _times(incident, scattered), strict=True)]
         if self.environment is not None:
             here = ShadedSegment(classified, sample.gradient, dt)
             tinted, unmodulated = self.environment.reflect(sample.s, magnitude, normal, w_o, sample.light.environment, cut, here)

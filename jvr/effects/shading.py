@@ -14,10 +14,11 @@ from jaxtyping import Array, Float
 
 from jvr.model.by_value import ByValue
 from jvr.model.effects import AbstractShading
+from jvr.model.lobes import about_half_way, about_mirrored
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import is_zero
 from jvr.model.ranges import AT_LEAST_ONE, NOT_NEGATIVE
-from jvr.numerics import direction_and_length, divide_or_zero, dot, larger, power_of_cosine, smaller
+from jvr.numerics import divide_or_zero, dot, larger, smaller
 from jvr.types import ArrayLike, Scalar, Triple
 
 
@@ -106,9 +107,7 @@ class Phong(Lambert):
         assign(self, specular=specular, shininess=shininess)
 
     def specular_lobe(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
-        twice = 2 * dot(normal, w_i)
-        mirrored = tuple(twice * n - w for n, w in zip(normal, w_i, strict=True))
-        return self.specular * power_of_cosine(mirrored, w_o, self.shininess)
+        return self.specular * about_mirrored(normal, w_o, w_i, self.shininess)
 
 
 class BlinnPhong(Phong):
@@ -129,8 +128,7 @@ class BlinnPhong(Phong):
         super().__init__(ambient, diffuse, specular, shininess, threshold=threshold, two_sided=two_sided)
 
     def specular_lobe(self, normal: Triple, w_o: Triple, w_i: Triple) -> Scalar | None:
-        half, length = direction_and_length(tuple(o + i for o, i in zip(w_o, w_i, strict=True)))
-        return jnp.where(length > 0, self.specular * power_of_cosine(normal, half, self.shininess), 0.0)
+        return self.specular * about_half_way(normal, w_o, w_i, self.shininess)
 
 
 def surface_weight(magnitude: Float[Array, "..."], threshold: Scalar) -> Float[Array, "..."]:

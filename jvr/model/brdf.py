@@ -15,11 +15,11 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jvr.model.lobes import about_half_way, about_mirrored
 from jvr.model.material import AbstractBRDF, SymmetryAxis
 from jvr.model.parameters import GREY_OR_RGB, assign, parameter
 from jvr.model.phase import AbstractPhase, ScatteringAngle, components
 from jvr.model.ranges import NOT_NEGATIVE, UNIT_INTERVAL
-from jvr.numerics import direction_and_length, power_of_cosine
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 
@@ -82,8 +82,7 @@ class PhongBRDF(AbstractGlossyBRDF):
         super().__init__(diffuse, specular, exponent)
 
     def lobe(self, w_o: Triple, w_i: Triple) -> Float[Array, "..."]:
-        mirrored = (-w_i[0], -w_i[1], w_i[2])
-        return (self.exponent + 2.0) / (2.0 * math.pi) * power_of_cosine(mirrored, w_o, self.exponent)
+        return (self.exponent + 2.0) / (2.0 * math.pi) * about_mirrored(_normal(), w_o, w_i, self.exponent)
 
 
 class BlinnPhongBRDF(AbstractGlossyBRDF):
@@ -98,10 +97,9 @@ class BlinnPhongBRDF(AbstractGlossyBRDF):
         super().__init__(diffuse, specular, exponent)
 
     def lobe(self, w_o: Triple, w_i: Triple) -> Float[Array, "..."]:
-        half, _ = direction_and_length(tuple(o + i for o, i in zip(w_o, w_i, strict=True)))
-        e, normal = self.exponent, (jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
+        e = self.exponent
         factor = (e + 2.0) * ((e + 4.0) / (8.0 * math.pi * (jnp.exp2(-0.5 * e) + e)))
-        return factor * power_of_cosine(half, normal, e)
+        return factor * about_half_way(_normal(), w_o, w_i, e)
 
 
 class PhaseBRDF(AbstractBRDF):
@@ -126,6 +124,11 @@ class PhaseBRDF(AbstractBRDF):
         albedo = [a for (a,) in components(self.albedo)]
         n = max(len(values), len(albedo))
         return tuple(albedo[c % len(albedo)] * values[c % len(values)] for c in range(n)), ()
+
+
+def _normal() -> Triple:
+    """In a surface's own frame."""
+    return jnp.zeros(()), jnp.zeros(()), jnp.ones(())
 
 
 def lambert(reflectance: Float[Array, "..."], w_i: Triple) -> Channels:

@@ -11,7 +11,15 @@ from jvr.names import Renamed
 from jvr.types import Channels, Scalar, Triple
 
 
-class AbstractShading(AbstractPart):
+class AbstractBSDF(AbstractPart):
+    """How light that arrives at a point is sent on to the eye: by surfaces and by the medium, of lights and of the environment."""
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        asked = {"lights": self.shows_lights, "environment": self.shows_environment, "gradient": self.needs_gradient}
+        return (PlanEntry(name, True, spelling(self), tuple(what for what, is_asked in asked.items() if is_asked)),)
+
+
+class AbstractShading(AbstractBSDF):
     """Local shading: how a surface reflects light."""
 
     ambient_share, surface_share = Renamed("ambient_reflectance"), Renamed("surface_weight")
@@ -24,9 +32,6 @@ class AbstractShading(AbstractPart):
     @property
     def shows_lights(self) -> bool:
         return True
-
-    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        return (PlanEntry(name, True, spelling(self), ("lights", "gradient")),)
 
     def without(self, scene: Any) -> Any:
         return scene.replaced(shading=None)
@@ -45,7 +50,7 @@ class AbstractShading(AbstractPart):
         in the colour of the light (`None` for nothing)."""
 
 
-class AbstractScattering(AbstractPart):
+class AbstractScattering(AbstractBSDF):
     """Single scattering: how the medium scatters light."""
 
     share = Renamed("medium_weight")
@@ -58,10 +63,6 @@ class AbstractScattering(AbstractPart):
     @property
     def shows_lights(self) -> bool:
         return True
-
-    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        needs = ("lights", "gradient") if self.needs_gradient else ("lights",)
-        return (PlanEntry(name, True, spelling(self), needs),)
 
     def without(self, scene: Any) -> Any:
         return scene.replaced(scattering=None)
@@ -96,16 +97,12 @@ class AbstractShadows(AbstractPart):
         """That of the scene's lights, as `AbstractPart.visibility`."""
 
 
-class AbstractMaterial(AbstractPart):
+class AbstractMaterial(AbstractBSDF):
     """A material: how a point sends light from all directions to the eye."""
 
     @property
     def shows_environment(self) -> bool:
         return True
-
-    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        needs = ("environment", "gradient") if self.needs_gradient else ("environment",)
-        return (PlanEntry(name, True, spelling(self), needs),)
 
     @property
     @abc.abstractmethod

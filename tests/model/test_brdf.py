@@ -1,5 +1,6 @@
 """Material functions: what a white furnace returns, reciprocity, closed forms, and derivatives at ordinary and extreme directions."""
 
+import math
 import re
 
 import equinox as eqx
@@ -314,3 +315,28 @@ def test_errors_say_what_is_wrong_in_one_line(name):
     with pytest.raises(ValueError, match=re.escape(says)) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 30.0])
+@pytest.mark.parametrize(
+    ("shading", "brdf", "scale"),
+    [
+        (jvr.Phong, jvr.PhongBRDF, lambda e: (e + 2) / (2 * math.pi)),
+        (jvr.BlinnPhong, jvr.BlinnPhongBRDF, lambda e: (e + 2) * (e + 4) / (8 * math.pi * (2 ** (-e / 2) + e))),
+    ],
+)
+def test_shading_and_materials_have_one_lobe_by_two_conventions(shading, brdf, scale, exponent, x64):
+    """The power of a cosine: as it is, and with the fraction that it reflects and the cosine of the light."""
+    w_o, w_i = (w / np.linalg.norm(w, axis=0) for w in np.random.default_rng(3).normal(size=(2, 3, 200)))
+    w_o[2], w_i[2] = np.abs(w_o[2]), np.abs(w_i[2])
+    half = (w_o + w_i) / np.linalg.norm(w_o + w_i, axis=0)
+    cosine = half[2] if shading is jvr.BlinnPhong else np.sum(w_o * w_i * [[-1], [-1], [1]], axis=0)
+    lobe = 0.4 * np.maximum(cosine, 0) ** exponent
+    one, (w_o, w_i) = jnp.ones(()), (tuple(map(jnp.asarray, w)) for w in (w_o, w_i))
+    surface, normal = shading(0.1, 0.5, 0.4, exponent), (0 * one, 0 * one, one)
+    of_shading = jax.vmap(lambda w_o, w_i: surface.reflect(one, normal, w_o, w_i))(w_o, w_i)
+    np.testing.assert_allclose(of_shading[0], 0.5 * w_i[2], rtol=1e-12)
+    np.testing.assert_allclose(of_shading[1], lobe, rtol=1e-9, atol=1e-12)
+    (diffuse,), (specular,) = brdf(0.5, 0.4, exponent).evaluate(w_o, w_i)
+    np.testing.assert_allclose(diffuse, 0.5 * w_i[2] / math.pi, rtol=1e-12)
+    np.testing.assert_allclose(specular, scale(exponent) * lobe * w_i[2], rtol=1e-9, atol=1e-12)
