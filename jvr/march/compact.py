@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Int, Shaped, UInt32
 
 Block = TypeVar("Block")
@@ -78,7 +79,8 @@ def for_each(
     # otherwise repeat the search in every single read.
     first = at(jnp.int32(0))
     start = (jnp.int32(0), first, at(jnp.int32(offsets.size)), read(first), carry)
-    return jax.lax.while_loop(lambda state: state[0] < selection.number, step, start)[-1]
+    # Under `vmap` there is one count of what is done for all of a batch (`jvr.march.wavefront`).
+    return jax.lax.while_loop(lambda state: unvmap_any(state[0] < selection.number), step, start)[-1]
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -5,7 +5,10 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Int
+
+from jvr.march.compact import select
 
 Inputs = TypeVar("Inputs")
 State = TypeVar("State")
@@ -41,11 +44,14 @@ def wavefront_while(
     order of `inputs`.
 
     Finished rays are thus not paid for, and memory in flight does not grow with the picture.
+
+    Under `vmap` loops go on for all of a batch while one of it has something to do: a condition for each would make JAX select between all
+    of the old state and the new in every step, `shared` included.
     """
     width, tail = (n if jax.default_backend() == "cpu" else ON_ACCELERATORS * n for n in (WAVEFRONT, TAIL))
     if work.shape[0] <= width:
         state, shared = jax.lax.while_loop(
-            lambda carry: jnp.any(alive(inputs, carry[0])), lambda carry: advance(inputs, *carry), (start(inputs), shared)
+            lambda carry: unvmap_any(alive(inputs, carry[0])), lambda carry: advance(inputs, *carry), (start(inputs), shared)
         )
         return finish(state), shared
     queue, size = _longest_first(work)
@@ -58,13 +64,13 @@ def wavefront_while(
 
     def filling(carry):
         own, state, _, _, following, _ = carry
-        return (following < size) | (jnp.sum(alive(own, state)) > tail)
+        return unvmap_any((following < size) | (jnp.sum(alive(own, state)) > tail))
 
     def drain_and_regenerate(carry):
         own, state, shared, index, following, results = carry
         enough = jnp.where(following < size, int(width * (1 - IDLE)), tail)
         state, shared = jax.lax.while_loop(
-            lambda c: jnp.sum(alive(own, c[0])) > enough, lambda c: advance(own, *c), (state, shared)
+            lambda c: unvmap_any(jnp.sum(alive(own, c[0])) > enough), lambda c: advance(own, *c), (state, shared)
         )
         results = put(results, index, state)
         idle = ~alive(own, state)
@@ -81,10 +87,11 @@ def wavefront_while(
     # Rays that are not alive are done and written; one of them fills up the smaller wavefront, and is written again. Where all are alive,
     # in a wavefront no larger than the smaller one, none may be taken twice: what it adds to `shared` would count twice.
     living = alive(own, state)
-    compacted = jnp.nonzero(living, size=min(tail, width), fill_value=jnp.argmin(living))[0]
+    selection, place = select(living), jnp.arange(min(tail, width), dtype=jnp.int32)
+    compacted = jnp.where(place < selection.number, selection.element(place), jnp.argmin(living))
     index, state = index[compacted], jax.tree.map(lambda x: x[compacted], state)
     own = take(index)
-    state, shared = jax.lax.while_loop(lambda c: jnp.any(alive(own, c[0])), lambda c: advance(own, *c), (state, shared))
+    state, shared = jax.lax.while_loop(lambda c: unvmap_any(alive(own, c[0])), lambda c: advance(own, *c), (state, shared))
     return put(results, index, state), shared
 
 
@@ -97,8 +104,9 @@ def _longest_first(work: Int[Array, "rays"]) -> tuple[Int[Array, "queue"], Int[A
     queue = (first[:, None] + jnp.arange(TOGETHER, dtype=jnp.int32)).ravel()
     busy = TOGETHER * jnp.sum(most > 0, dtype=jnp.int32)
     if queue.size > rays:
-        # The last group is not full. What fills it up is no ray and must not be started.
-        queue = queue[jnp.nonzero(queue < rays, size=rays)[0]]
+        # The last group is not full. What fills up its end is no ray and must not be started.
+        place = jnp.arange(rays, dtype=jnp.int32)
+        queue = queue[jnp.where(place < jnp.argmax(queue >= rays), place, place + queue.size - rays)]
         busy -= jnp.where(most[-1] > 0, -rays % TOGETHER, 0).astype(jnp.int32)
     return queue, busy
 

@@ -64,3 +64,25 @@ def test_a_wavefront_smaller_than_its_tail_counts_no_ray_twice(monkeypatch):
     results, total = run(work)
     np.testing.assert_array_equal(results["steps"], work)
     assert total == work.sum()
+
+
+def test_a_batch_goes_on_together():
+    """Of queues that end at different times, without a condition for each, which is a selection of the whole state in every step."""
+    rng = np.random.default_rng(3)
+    batch = np.stack([rng.geometric(0.05, 203), np.where(np.arange(203) == 7, 90, 0), rng.geometric(0.5, 203)]).astype(np.int32)
+    results, total = jax.jit(jax.vmap(run))(batch)
+    np.testing.assert_array_equal(results["steps"], batch)
+    np.testing.assert_array_equal(results["sum"], batch * np.arange(1, 204))
+    np.testing.assert_array_equal(total, batch.sum(axis=1))
+    assert conditions(jax.make_jaxpr(jax.vmap(run))(batch)) == [(), (), ()]
+
+
+def conditions(program):
+    """The shapes of the conditions of loops."""
+    found = []
+    for equation in program.eqns:
+        if equation.primitive.name == "while":
+            found += [condition.shape for condition in equation.params["cond_jaxpr"].out_avals]
+        for inner in equation.params.values():
+            found += conditions(inner) if hasattr(inner, "eqns") else []
+    return found

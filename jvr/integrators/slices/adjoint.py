@@ -18,6 +18,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.integrators.slices.march import (
@@ -99,7 +100,7 @@ def replay(options: SliceOptions, slices: Sliced, wanted: Any, end: End, cotange
         return base + options.period, after, _deposit(options, slices, base, taps, gradient)
 
     start = (jnp.int32(0), blank_sums(options, slices), jax.tree.map(jnp.zeros_like, wanted))
-    return jax.lax.while_loop(lambda carry: jnp.any(end.ended > carry[0]), block, start)[2]
+    return jax.lax.while_loop(lambda carry: unvmap_any(end.ended > carry[0]), block, start)[2]
 
 
 def _block(

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.integrators.slices.oracle import DistanceField
@@ -134,7 +135,7 @@ def march_slices(options: SliceOptions, slices: Sliced) -> End:
         return base + options.period, pyramid, End(sums, end.steps + gathered.steps, ended, end.samples + samples)
 
     start = (jnp.int32(0), pyramid, End(blank_sums(options, slices), jnp.zeros_like(ended), ended, samples))
-    return jax.lax.while_loop(lambda carry: jnp.any(carry[2].ended > carry[0]), block, start)[2]
+    return jax.lax.while_loop(lambda carry: unvmap_any(carry[2].ended > carry[0]), block, start)[2]
 
 
 def take_block(

@@ -13,6 +13,7 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from equinox.internal import unvmap_any
 from jaxtyping import Array, Float, Int
 
 from jvr.model.bricks import bricks_of
@@ -148,7 +149,8 @@ def envelope(wanted: Float[Array, "bx by bz"], thickness: Triple, farthest: Scal
         return k + 1, smallest, jnp.minimum(distance, smallest + k * finest)
 
     start = (jnp.int32(0), wanted, jnp.minimum(wanted, farthest))
-    return jax.lax.while_loop(lambda state: state[0] * finest < farthest, grow, start)[2]
+    # Beyond `farthest`, as far as another of a batch may look, nothing changes.
+    return jax.lax.while_loop(lambda state: unvmap_any(state[0] * finest < farthest), grow, start)[2]
 
 
 def _smallest_of_three(values: Float[Array, "x y z"], axis: int) -> Float[Array, "x y z"]:
