@@ -52,7 +52,8 @@ class Parameter:
     - `within`: the values that it takes.
     - `doc`: what it is, in a few words that errors and the reference show; `unit`: of its numbers; `hint`: a value to begin with.
     - `shapes`: of its array; `None`: as the annotation says.
-    - `by_scalar`: whether a `jvr.ByValue` may stand in its place.
+    - `by_scalar`: whether a `jvr.ByValue` may stand in its place. The field is then annotated `Any`: it holds the one or the other, while
+      methods along a ray see numbers alone (`jvr.model.by_value.at_value`), which no annotation of one field says to a type checker.
     - `by_channel`: whether, where the last axis is colour, each of its channels acts on that channel of a picture alone, as those of light
       do. A fit then takes one forward derivative for all three.
     - `least`: entries that a named axis has at least.

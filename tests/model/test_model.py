@@ -74,6 +74,16 @@ ERRORS = {
     "step zero": (lambda: jvr.Settings(0.0), ValueError, "step must be positive"),
     "step infinite": (lambda: jvr.Settings(np.inf), ValueError, "step must be positive"),
     "termination 1": (lambda: jvr.Settings(termination=1.0), ValueError, "in [0, 1)"),
+    "half a camera": (lambda: jvr.fibonacci_sphere((0, 0, 0), 9.0, 1.5, 30, 4, 4), ValueError, "count must be a whole number"),
+    "cameras at their centre": (lambda: jvr.orbit((0, 0, 0), 0.0, 2, 30, 4, 4), ValueError, "radius must be positive"),
+    "no axis": (lambda: jvr.orbit((0, 0, 0), 9, 2, 30, 4, 4, axis=(0, 0, 0)), ValueError, "axis must have a direction"),
+    "disc of no size": (
+        lambda: jvr.EnvironmentLight.disc((0, 0, 1), 0),
+        ValueError,
+        "half_angle must be above 0 and at most 180",
+    ),
+    "disc of radiance below zero": (lambda: jvr.EnvironmentLight.disc((0, 0, 1), 9, -1), ValueError, "radiance must be finite"),
+    "parts of nothing": (lambda: jvr.PreIntegrated(0), ValueError, "parts must be a whole number of at least 1"),
     "tile zero": (lambda: jvr.Settings(tile=0), ValueError, "tile must be a whole number of at least 1"),
     "window zero": (lambda: jvr.presets.window_level(0.0, 40.0), ValueError, "window must be positive"),
 }
