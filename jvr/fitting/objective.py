@@ -103,7 +103,7 @@ def check_derivatives(problem: Problem, tiles: Observations, *, forwards: bool) 
     # Whatever JAX says of what it cannot differentiate: what is wrong with the function itself has been raised before.
     except Exception as error:
         name, mode = type(problem.integrator).__name__, "forward" if forwards else "reverse"
-        reason = str(error).strip().splitlines()[0]
+        reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise ValueError(f"a fit takes derivatives of {name} in {mode} mode, which has none: {reason}") from error
 
 

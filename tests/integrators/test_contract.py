@@ -78,6 +78,27 @@ class Counted(AbstractRayIntegrator):
         return Radiance(jnp.stack((1 - T,) * 3, axis=-1), 1 - T, 0 * T, jnp.ones(T.shape, jnp.int32))
 
 
+@jax.custom_vjp
+def one_way(x):
+    return x
+
+
+def _refuse(residuals, cotangent):
+    raise NotImplementedError
+
+
+one_way.defvjp(lambda x: (x, None), _refuse)
+
+
+class Silent(Uniform):
+    """The same as by default, by rules of whose own one refuses without a word."""
+
+    marches = False
+
+    def radiance(self, prepared, rays):
+        return jax.tree.map(one_way, super().radiance(prepared, rays))
+
+
 class Drawn(Uniform):
     """The same as by default, but that it says that it has no derivatives."""
 
@@ -152,6 +173,7 @@ def test_what_has_no_derivative_says_so_in_a_line():
     target = np.zeros((2, 2, 3))
     refused = {
         "a fit takes derivatives of Counted in reverse mode, which has none: Reverse-mode": Counted(),
+        "a fit takes derivatives of Silent in reverse mode, which has none: NotImplementedError": Silent(),
         "a fit goes by derivatives, and Drawn has none: leave Settings(sampling=...) at jvr.Uniform()": Drawn(),
     }
     for message, integrator in refused.items():
