@@ -90,7 +90,7 @@ def precompute(
         scene = eqx.tree_at(lambda s: s.radiance_transfer.scattering, scene, None)
     # The light plays no part, and the material where rays do not pick up its colour none but that it has a normal.
     plays, normal = (
-        radiance_transfer.rays_need_gradient,
+        radiance_transfer.bleeding is not None and radiance_transfer.bleeding.reads_material,
         scene.material is not None and scene.material.needs_gradient,
     )
     inputs = (
