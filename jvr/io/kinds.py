@@ -99,6 +99,7 @@ KINDS: dict[type, dict[str, str]] = {
     AbstractCamera: {
         "perspective": "PerspectiveCamera",
         "orthographic": "OrthographicCamera",
+        "pinhole": "PinholeCamera",
         "fibonacci": "fibonacci_sphere",
         "orbit": "orbit",
     },

@@ -231,6 +231,17 @@ def test_an_automatic_camera_shows_the_whole_volume_and_little_more(kind, width,
     assert max(np.mean(hit.any(axis=0)), np.mean(hit.any(axis=1))) > 0.75
 
 
+def test_a_pinhole_camera_of_a_configuration():
+    keys = "kind='pinhole',focal_lengths=[80,90],principal_point=[30,20],width=60,height=48"
+    _, (camera,), _ = build(config(BASE, f"camera={{{keys},eye=[0,-200,5],target=[1,2,3]}}"))
+    pose = jvr.PerspectiveCamera.look_at((0, -200, 5), (1, 2, 3), (0, 0, 1), 30, 60, 48).world_from_camera
+    expected = jvr.PinholeCamera(pose, (80, 90), 60, 48, principal_point=(30, 20))
+    for ours, theirs in zip(camera.rays(jnp.arange(60 * 48)), expected.rays(jnp.arange(60 * 48)), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    with pytest.raises(ConfigError, match="camera: eye is missing"):
+        build(config(BASE, f"camera={{{keys}}}"))
+
+
 def test_scaling_maps_a_range_to_the_unit_interval():
     volume = build_scene(config(BASE, "volume.scale=[0.2, 0.6]")).volume
     before = build_scene(config(BASE)).volume
