@@ -144,7 +144,8 @@ class PinholeCamera(AbstractCamera):
         self.world_from_camera = affine(world_from_camera, "world_from_camera")
         self.remainder = Remainder.left(world_from_camera, self.world_from_camera, remainder)
         middle = (width / 2, height / 2) if principal_point is None else principal_point
-        assign(self, focal_lengths=focal_lengths, principal_point=middle, width=width, height=height)
+        # A size of zero would be blamed on the focal length that somebody made of it.
+        assign(self, width=width, height=height, focal_lengths=focal_lengths, principal_point=middle)
 
     def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
         row, column = jnp.divmod(pixels, self.width)

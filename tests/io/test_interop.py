@@ -173,8 +173,17 @@ def test_transforms_of_nerf(tmp_path):
         (lambda f: interop.read_transforms(f("[1]")), "no transforms.json with frames"),
         (lambda f: interop.read_transforms(f('{"frames": [{"file_path": "a.png"}], "w": 4, "h": 4}')), "no transforms.json"),
         (lambda f: interop.read_transforms(f(_frames(np.eye(4)))), "neither fl_x nor camera_angle_x"),
-        (lambda f: interop.read_transforms(f(_frames(2 * np.eye(4)))), "frame 0 is not a rigid transform"),
+        (lambda f: interop.read_transforms(f(_frames(2 * np.eye(4)))), "frame 0: its transform_matrix is not a rigid"),
         (lambda f: interop.read_transforms(f(_frames(np.eye(4), k1=0.1))), "its lens distorts"),
+        (lambda f: interop.read_transforms(f(_frames(np.eye(4), camera_angle_x=0))), "camera_angle_x must be between 0 and pi"),
+        (lambda f: interop.read_transforms(f(_frames(np.eye(4), fl_x=-2))), "frame 0: focal_lengths must be positive"),
+        (lambda f: interop.read_transforms(f(_frames(np.eye(4), fl_x=9, w="wide"))), "frame 0: .*'wide'"),
+        (lambda f: interop.read_transforms(f(_frames(np.eye(4), fl_x=9, w=0))), "frame 0: width must be"),
+        (lambda f: interop.read_transforms(f('{"frames": []}')), "it names no frames"),
+        (lambda f: interop.read_transforms(f(_frames(np.eye(4)).replace("1.0", '"x"'))), "no transforms.json"),
+        (lambda f: interop.from_paraview(f("<!DOCTYPE a><a/>"), 4, 4), "entities, which are never read"),
+        (lambda f: interop.from_paraview(f(PVCC.format(parallel=0).replace('"41"', '"190"')), 4, 4), "file: fov_y must be"),
+        (lambda _: interop.from_vtk(of_vtk(), 4, 0), "height must be"),
     ],
 )
 def test_what_is_no_camera_is_refused_in_one_line(tmp_path, made, said):

@@ -6,12 +6,14 @@ the picture. OpenCV's have x to the right, y down, z forward, `x_camera = R x_wo
 
 import math
 import os
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jvr.io.volumes.errors import one_line
 from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, PinholeCamera
 from jvr.types import ArrayLike
 
@@ -21,6 +23,13 @@ FLIPPED, FROM_RAS = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1
 LARGEST = 1_000_000
 PLACES = ("position", "focal_point", "view_up")
 KEYS = (*PLACES, "view_angle", "parallel_scale")
+
+
+class CameraError(ValueError):
+    """A file of cameras that cannot be read: one line that names the file, what is wrong and what would be right."""
+
+    def __init__(self, path: str | os.PathLike, problem: str):
+        super().__init__(" ".join(f"{path}: {problem}".split()))
 
 
 def from_vtk(camera: Any, width: int, height: int, *, ras: bool = False) -> AbstractCamera:
@@ -34,7 +43,7 @@ def from_vtk(camera: Any, width: int, height: int, *, ras: bool = False) -> Abst
     """
     world = FROM_RAS if ras else np.eye(4)
     if not isinstance(camera, dict):
-        return _of_matrices(*_matrices(camera, width / height), world, width, height)
+        return _of_matrices(*_matrices(camera, width / max(height, 1)), world, width, height)
     missing, odd = [key for key in PLACES if key not in camera], [key for key in camera if key not in KEYS]
     if missing or odd:
         problem = f"has no {missing[0]}" if missing else f"has a key {odd[0]}"
@@ -73,7 +82,8 @@ def of_focal_lengths(
     pose: np.ndarray, focal: np.ndarray, principal: np.ndarray, width: int, height: int
 ) -> PerspectiveCamera | PinholeCamera:
     """The plainest camera that it is."""
-    if np.allclose(focal[0], focal[1], rtol=1e-7) and np.allclose(principal, (width / 2, height / 2), rtol=1e-7):
+    plain = focal[1] > 0 and np.allclose(focal[0], focal[1], rtol=1e-7)
+    if plain and np.allclose(principal, (width / 2, height / 2), rtol=1e-7):
         return PerspectiveCamera(pose, math.degrees(2 * math.atan(height / (2 * focal[1]))), width, height)
     return PinholeCamera(pose, focal, width, height, principal_point=principal)
 
@@ -81,26 +91,39 @@ def of_focal_lengths(
 def from_paraview(path: str | os.PathLike, width: int, height: int) -> AbstractCamera:
     """The camera of a file that ParaView's "Adjust Camera" dialog saves (`.pvcc`), for a picture of the given size.
 
-    **Raises** `ValueError` for what is no such file.
+    **Raises** `CameraError`, a `ValueError`, for what is no such file.
     """
-    content = Path(path).read_bytes()[: LARGEST + 1]
-    if len(content) > LARGEST or b"<!ENTITY" in content:
-        raise ValueError(f"{path}: not a camera of ParaView, which is a small XML file: save it anew")
+    with Path(path).open("rb") as file:
+        content = file.read(LARGEST + 1)
+    if len(content) > LARGEST:
+        raise CameraError(path, "not a camera of ParaView, which takes a few kB: save it anew in the dialog Adjust Camera")
     try:
-        properties = {str(found.get("name")): found for found in ElementTree.fromstring(content).iter("Property")}
-        numbers = lambda name: [float(str(e.get("value"))) for e in properties[f"Camera{name}"].iter("Element") if e.get("value")]
-        said: dict[str, Any] = {
-            "position": numbers("Position"),
-            "focal_point": numbers("FocalPoint"),
-            "view_up": numbers("ViewUp"),
-            "view_angle": numbers("ViewAngle")[0],
-        }
-        if "CameraParallelProjection" in properties and numbers("ParallelProjection")[0]:
-            said["parallel_scale"] = numbers("ParallelScale")[0]
+        said = _said_by_paraview(content.decode())
     except (ElementTree.ParseError, KeyError, IndexError, ValueError) as error:
-        found = " ".join(f"{type(error).__name__} {error}".split())[:80]
-        raise ValueError(f"{path}: not a camera of ParaView ({found}): save it anew in the dialog Adjust Camera") from None
-    return from_vtk(said, width, height)
+        problem = f"not a camera of ParaView ({type(error).__name__}: {one_line(error)})"
+        raise CameraError(path, f"{problem}: save it anew in the dialog Adjust Camera") from None
+    try:
+        return from_vtk(said, width, height)
+    except ValueError as error:
+        raise CameraError(path, str(error)) from None
+
+
+def _said_by_paraview(text: str) -> dict[str, Any]:
+    if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+        raise ValueError("it defines entities, which are never read")
+    properties = {str(found.get("name")): found for found in ElementTree.fromstring(text).iter("Property")}
+    numbers = lambda name: [float(str(e.get("value"))) for e in properties[f"Camera{name}"].iter("Element") if e.get("value")]
+    said: dict[str, Any] = {
+        "position": numbers("Position"),
+        "focal_point": numbers("FocalPoint"),
+        "view_up": numbers("ViewUp"),
+        "view_angle": numbers("ViewAngle")[0],
+    }
+    if "CameraParallelProjection" in properties and numbers("ParallelProjection")[0]:
+        said["parallel_scale"] = numbers("ParallelScale")[0]
+    if any(len(said[key]) != 3 for key in PLACES):
+        raise ValueError("a place has three numbers")
+    return said
 
 
 def to_vtk(camera: AbstractCamera) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Reflectance, configurations, transfer functions, scenes and the checkpoints of fits."""
 
 import hashlib
+import json
 import re
 import struct
 from pathlib import Path
@@ -41,6 +42,7 @@ def tables(folder: Path) -> dict[str, Seed]:
     seeds["config, scene"] = _scene(files)
     for kind, text in TRANSFERS.items():
         seeds[f"transfer, {kind}"] = Seed({"a.toml": text.encode()}, "a.toml", read_transfer, (ConfigError,))
+    seeds |= _cameras()
     seeds["merl"] = _merl()
     seeds["checkpoint"] = _checkpoint(folder)
     return seeds | _scenes(folder)
@@ -58,6 +60,23 @@ def _scene(files: dict[str, bytes]) -> Seed:
         return build_cameras(config, scene.volume, scene.transfer), build_settings(config)
 
     return Seed(files, "a.toml", read, (ConfigError, VolumeError))
+
+
+def _cameras() -> dict[str, Seed]:
+    """Cameras of other programs."""
+    from jvr.io import interop
+
+    places = {"Position": (9, 8, 7), "FocalPoint": (0, 0, 0), "ViewUp": (0, 0, 1), "ViewAngle": (30,), "ParallelProjection": (0,)}
+    elements = lambda values: "".join(f'<Element index="{i}" value="{v}"/>' for i, v in enumerate(values))
+    properties = (f'<Property name="Camera{name}">{elements(values)}</Property>' for name, values in places.items())
+    paraview = f'<?xml version="1.0"?><PVCameraConfiguration><Proxy>{"".join(properties)}</Proxy></PVCameraConfiguration>'
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    transforms = json.dumps({"w": 8, "h": 6, "fl_x": 9.5, "cx": 4.5, "frames": [frame, frame | {"camera_angle_y": 0.5}]})
+    read = lambda path: interop.from_paraview(path, 8, 6)
+    return {
+        "camera, pvcc": Seed({"a.pvcc": paraview.encode()}, "a.pvcc", read, (interop.CameraError,)),
+        "cameras, json": Seed({"a.json": transforms.encode()}, "a.json", interop.read_transforms, (interop.CameraError,)),
+    }
 
 
 def _merl() -> Seed:
