@@ -24,7 +24,7 @@ class Renderer:
     """One scene in `jvr`; voxels, transfer function and camera are arguments of the compiled programs."""
 
     def __init__(self, scene: scenes.Scene):
-        self.scene, self.camera = _scene(scene), _camera(scene.view)
+        self.scene, self.camera = scene_of(scene), camera_of(scene.view)
 
     def prepare(self, step: float, shadows: Any = None) -> None:
         """`shadows` is one of jvr's, for a scene that is lit."""
@@ -69,7 +69,7 @@ class Reference:
     def __init__(self, scene: scenes.Scene):
         if jnp.zeros(()).dtype != jnp.float64:
             raise RuntimeError("the reference needs JAX_ENABLE_X64=1")
-        self.scene, self.view = _scene(scene), scene.view
+        self.scene, self.view = scene_of(scene), scene.view
         step = REFERENCE_STEP if scene.scattering is None else LIT_REFERENCE_STEP
         self.settings = jvr.Settings(step, termination=0.0, skipping=False)
         if scene.scattering is not None:
@@ -79,19 +79,19 @@ class Reference:
         """One ray through the centre of each pixel, or the mean of `across` x `across` rays spread over it."""
         view = self.view
         fine = dataclasses.replace(view, width=across * view.width, height=across * view.height)
-        seen = jax.jit(jvr.render)(self.scene, _camera(fine), self.settings).rgb
+        seen = jax.jit(jvr.render)(self.scene, camera_of(fine), self.settings).rgb
         return np.asarray(seen).reshape(view.height, across, view.width, across, 3).mean(axis=(1, 3))
 
     def gradient(self) -> tuple[np.ndarray, np.ndarray]:
         gradient, _ = jax.jit(jax.grad(_loss, has_aux=True), static_argnums=3)(
-            ENTRIES(self.scene), self.scene, _camera(self.view), self.settings
+            ENTRIES(self.scene), self.scene, camera_of(self.view), self.settings
         )
         return jax.tree.map(np.asarray, gradient)
 
 
 def to_jvr(scene: scenes.Scene) -> tuple[jvr.Scene, jvr.PerspectiveCamera]:
     """A scene of the peers as jvr's own."""
-    return _scene(scene), _camera(scene.view)
+    return scene_of(scene), camera_of(scene.view)
 
 
 def _loss(entries: Any, scene: jvr.Scene, camera: jvr.PerspectiveCamera, settings: jvr.Settings) -> tuple[jax.Array, jax.Array]:
@@ -103,7 +103,7 @@ def _loss(entries: Any, scene: jvr.Scene, camera: jvr.PerspectiveCamera, setting
 _difference = jax.jit(lambda picture: jnp.mean(jnp.square(picture - 0.5)))
 
 
-def _scene(scene: scenes.Scene) -> jvr.Scene:
+def scene_of(scene: scenes.Scene) -> jvr.Scene:
     world_from_grid = np.diag([*scene.spacing, 1.0])
     world_from_grid[:3, 3] = scene.origin
     # As the others, bounds its bricks once.
@@ -123,5 +123,5 @@ def _shaded(scene: jvr.Scene, shadows: Any) -> jvr.Scene:
     return eqx.tree_at(lambda s: s.shadows, scene, shadows, is_leaf=lambda x: x is None)
 
 
-def _camera(view: scenes.View) -> jvr.PerspectiveCamera:
+def camera_of(view: scenes.View) -> jvr.PerspectiveCamera:
     return jvr.PerspectiveCamera.look_at(view.eye, view.target, view.up, view.fov_y, view.width, view.height)

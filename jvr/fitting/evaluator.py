@@ -1,7 +1,7 @@
 """The functions that solvers call, over the rays of one fit."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.execution.devices import everywhere, shares
-from jvr.fitting.identifiability import Identifiability, identifiability
+from jvr.fitting.continuation import Quadratic
+from jvr.fitting.identifiability import Identifiability, Scores, identifiability
 from jvr.fitting.losses import DSSIM, SquaredError
-from jvr.fitting.normal_equations import Normal, light_tangents, normal_equations, prior_expansion
+from jvr.fitting.normal_equations import Normal, light_tangents, normal_equations, prior_expansion, scored
 from jvr.fitting.objective import image_value, residuals, value
 from jvr.fitting.observations import Observations
 from jvr.fitting.problem import Problem
@@ -78,7 +79,7 @@ class Evaluator:
         """The objective at `unconstrained`, over the rays of a level, and the normal equations in the unknowns' own values."""
         values = self.problem.unknowns.values_from_unconstrained(jnp.asarray(unconstrained), self.problem.model)
         normal, total = self._sum(values, self.levels[level]), self.sums[level].residuals
-        prior, _, _ = prior_expansion(self.problem, values) if self.problem.priors else (0.0, None, None)
+        prior, _, _ = self._prior(values)
         # Per residual, so that levels with different numbers of rays have the same scale.
         normal = jax.tree.map(lambda x: x / total, normal)
         return float(normal.loss) + float(prior), normal
@@ -86,13 +87,8 @@ class Evaluator:
     def quadratic(self, unconstrained: np.ndarray, normal: Normal) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and Gauss-Newton matrix of the objective in unconstrained space."""
         unknowns, model = self.problem.unknowns, self.problem.model
-        gradient, matrix = 2 * normal.vector, 2 * normal.matrix
-        if self.problem.priors:
-            _, prior_gradient, prior_matrix = prior_expansion(
-                self.problem, unknowns.values_from_unconstrained(jnp.asarray(unconstrained), model)
-            )
-            gradient = gradient + np.asarray(prior_gradient, np.float64)
-            matrix = matrix + np.asarray(prior_matrix, np.float64)
+        _, of_prior, curvature = self._prior(unknowns.values_from_unconstrained(jnp.asarray(unconstrained), model))
+        gradient, matrix = 2 * normal.vector + of_prior, 2 * normal.matrix + curvature
         slope = np.asarray(_slope(unknowns, model, jnp.asarray(unconstrained)), np.float64)
         return slope.T @ gradient, slope.T @ matrix @ slope
 
@@ -105,15 +101,32 @@ class Evaluator:
         sums = self.sums[-1]
         return (ROUNDING * float(jnp.finfo(self.observations.target.dtype).eps)) ** 2 * sums.squares / sums.residuals
 
-    def identifiability(self, values: Float[Array, "unknowns"]) -> Identifiability:
-        """Standard errors at the solution, over all rays."""
-        problem = self.problem
-        if isinstance(problem.loss, DSSIM):
-            # A loss over whole images has no residual variance: the errors are those that its solution has as least squares.
-            problem = problem.least_squares()
-        normal = self._sum(values, 1, problem)
-        matrix = normal.matrix + self._gauge(values, np.diag(normal.matrix))
-        return identifiability(matrix, float(normal.squares), self.sums[-1].measurements, float(jnp.finfo(values.dtype).eps))
+    def solution(self, values: Float[Array, "unknowns"]) -> tuple[Identifiability, Quadratic]:
+        """Standard errors at the solution, and the objective about it, over all rays."""
+        normal, scores = self._scored(values, self._squares)
+        matrix, epsilon = normal.matrix + self._gauge(values, np.diag(normal.matrix)), float(jnp.finfo(values.dtype).eps)
+        known = identifiability(matrix, float(normal.squares), self.sums[-1].measurements, epsilon, scores)
+        prior, slope, curvature = self._prior(values)
+        total = self.sums[-1].residuals
+        loss, gradient, matrix = (x / total for x in (normal.loss, 2 * normal.vector, 2 * normal.matrix))
+        return known, Quadratic(float(loss + prior), gradient + slope, matrix + curvature, self._rounding())
+
+    def objective(self, values: np.ndarray) -> float:
+        """The objective as `solution` has it, of the unknowns' own values."""
+        at = jnp.asarray(values, self.observations.target.dtype)
+        return float(self._sum(at, 1, self._squares).loss) / self.sums[-1].residuals + float(self._prior(at)[0])
+
+    @property
+    def _squares(self) -> Problem:
+        """The problem as least squares: a loss over whole images has no rows."""
+        return self.problem.least_squares() if isinstance(self.problem.loss, DSSIM) else self.problem
+
+    def _prior(self, values: Float[Array, "unknowns"]) -> tuple[Any, Any, Any]:
+        """Value, gradient and Hessian of the priors in float64."""
+        if not self.problem.priors:
+            return 0.0, 0.0, 0.0
+        prior, slope, curvature = (np.asarray(x, np.float64) for x in prior_expansion(self.problem, values))
+        return prior, slope, curvature
 
     def _gauge(self, values: Float[Array, "unknowns"], diagonal: np.ndarray) -> np.ndarray:
         """What fixes the length of directions: it is 1 by convention, and no image says anything about it."""
@@ -148,8 +161,12 @@ class Evaluator:
         problem, observations = problem or self.problem, self.observations
         around = light_tangents(problem, values)
         tiles = range(observations.tile_count(every))
-        parts = [normal_equations(problem, values, observations, i, every, around) for i in tiles]
-        return jax.tree.map(lambda *p: np.sum([np.asarray(x, np.float64) for x in p], axis=0), *parts)
+        return _added(normal_equations(problem, values, observations, i, every, around) for i in tiles)
+
+    def _scored(self, values: Float[Array, "unknowns"], problem: Problem) -> tuple[Normal, Scores]:
+        """The normal equations of all rays, and the sums that tell misfit from noise."""
+        observations, around, blocks = self.observations, light_tangents(problem, values), self.sums[-1].blocks
+        return _added(scored(problem, values, observations, i, blocks, around) for i in range(observations.tile_count()))
 
     def _functions(self, cameras: Sequence[AbstractCamera], images: Any) -> Functions:
         total = jnp.asarray(self.sums[-1].residuals)
@@ -162,26 +179,38 @@ class Evaluator:
         return Functions(function, residuals, levels, self.limits, self.quadratic, self._rounding())
 
 
+def _added(parts: Iterable[Any]) -> Any:
+    """Sums over tiles, in float64."""
+    total = None
+    for part in parts:
+        part = jax.tree.map(lambda x: np.asarray(x, np.float64), part)
+        total = part if total is None else jax.tree.map(np.add, total, part)
+    return total
+
+
 class Sums(NamedTuple):
-    """Over the rays of a level: `residuals`, their weighted number; `squares` of the targets, weighted; how many `measurements` count."""
+    """Over the rays of a level: `residuals`, their weighted number; `squares` of the targets, weighted; how many `measurements` count;
+    `blocks` of pixels in all images."""
 
     residuals: float
     squares: float
     measurements: int
+    blocks: int
 
 
 def _sums(observations: Observations, every: int) -> Sums:
-    weight, squares, counted = _weights(observations, every)
-    return Sums(max(3 * float(weight), float(np.finfo(np.float32).tiny)), float(squares), 3 * int(counted))
+    weight, squares, counted, last = _weights(observations, every)
+    total = max(3 * float(weight), float(np.finfo(np.float32).tiny))
+    return Sums(total, float(squares), 3 * int(counted), int(last) + 1)
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _weights(observations: Observations, every: int) -> tuple[Array, Array, Array]:
+def _weights(observations: Observations, every: int) -> tuple[Array, Array, Array, Array]:
     each = observations.size // shares()
     taken = (jnp.arange(observations.size) % each % every == 0).reshape(observations.weight.shape)
     weight = jnp.where(taken, observations.weight, 0)
     squares = jnp.sum(weight[..., None] * jnp.square(observations.target))
-    return everywhere((jnp.sum(weight), squares, jnp.sum(weight > 0)))
+    return everywhere((jnp.sum(weight), squares, jnp.sum(weight > 0), jnp.max(observations.block)))
 
 
 def _levels(problem: Problem, observations: Observations) -> tuple[int, ...]:

@@ -1,6 +1,7 @@
 """The normal equations of a fit, for solvers that use the Jacobian: its rows are made chunk by chunk of rays and summed up at once, so that
 a matrix of all rays is never held."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jvr.execution.devices import everywhere, over_rays
+from jvr.fitting.identifiability import Scores
 from jvr.fitting.kinds import Kinds, TableEntries
 from jvr.fitting.objective import seen
 from jvr.fitting.observations import Observations, inside, observed_medium, prepare_in_fit
@@ -24,9 +26,12 @@ from jvr.rendering.medium import Prepared
 from jvr.types import Triple
 
 
-class _Channel(eqx.Module):
-    """One colour channel of a tile: for each ray `r`, `w` and `w rho(r)` of `Normal`, and its row for the unknowns in `columns`."""
+class Channel(eqx.Module):
+    """One colour channel of a tile: for each ray its block of pixels, its colour, `r`, `w` and `w rho(r)` of `Normal`, and its row for the
+    unknowns in `columns`."""
 
+    block: Int[Array, "rays"]
+    colour: Float[Array, "rays"]
     residual: Float[Array, "rays"]
     weight: Float[Array, "rays"]
     loss: Float[Array, "rays"]
@@ -110,6 +115,20 @@ def normal_equations(
         return _sums(channels, values.size)
 
 
+def scored(
+    problem: Problem,
+    values: Float[Array, "unknowns"],
+    observations: Observations,
+    index: int,
+    blocks: int,
+    around: LightTangents | None = None,
+) -> tuple[Normal, Scores]:
+    """`normal_equations` of one tile, with the sums over its `blocks` of pixels that tell misfit from noise."""
+    channels = _channels(problem, values, observations, (jnp.int32(index), jnp.int32(1)), around)
+    with jax.enable_x64(True):
+        return _sums(channels, values.size), _scores(channels, values.size, blocks)
+
+
 @eqx.filter_jit
 def _channels(
     problem: Problem,
@@ -117,12 +136,10 @@ def _channels(
     observations: Observations,
     place: tuple[Int[Array, ""], Int[Array, ""]],
     around: LightTangents | None,
-) -> list[_Channel]:
+) -> list[Channel]:
     shared, stored = problem.apart()
 
-    def share(
-        shared: tuple[Problem, Array, Any, LightTangents | None], rays: tuple[Array | None, Observations]
-    ) -> list[_Channel]:
+    def share(shared: tuple[Problem, Array, Any, LightTangents | None], rays: tuple[Array | None, Observations]) -> list[Channel]:
         problem, values, place, around = shared
         stored, observations = rays
         return _share_of_channels(problem.reassembled(stored), values, observations.tile(*place), around)
@@ -132,7 +149,7 @@ def _channels(
 
 def _share_of_channels(
     problem: Problem, values: Float[Array, "unknowns"], tile: Observations, around: LightTangents | None
-) -> list[_Channel]:
+) -> list[Channel]:
     colours, blocks = _jacobian(problem, values, tile, around)
     channels = []
     for c, colour in enumerate(colours):
@@ -140,15 +157,17 @@ def _share_of_channels(
         rows = jnp.concatenate([block for block, _ in blocks[c]], axis=1)
         columns = tuple(np.concatenate([columns for _, columns in blocks[c]]).tolist())
         losses = tile.weight * problem.loss.value(r)
-        channels.append(_Channel(r, tile.weight * problem.loss.weight(r), losses, rows, columns))
+        weight = tile.weight * problem.loss.weight(r)
+        channels.append(Channel(tile.block, colour, r, weight, losses, rows, columns))
     return channels
 
 
 @eqx.filter_jit
-def _sums(channels: list[_Channel], n: int) -> Normal:
+def _sums(channels: list[Channel], n: int) -> Normal:
     total = Normal(jnp.zeros(()), jnp.zeros(()), jnp.zeros((n, n)), jnp.zeros(n))
     for channel in channels:
-        r, weight, losses, rows = (x.astype(float) for x in jax.tree.leaves(channel))
+        fields = channel.residual, channel.weight, channel.loss, channel.rows
+        r, weight, losses, rows = (x.astype(float) for x in fields)
         weighted, columns = rows * weight[:, None], np.asarray(channel.columns, np.int32)
         total = Normal(
             total.loss + jnp.sum(losses),
@@ -157,6 +176,25 @@ def _sums(channels: list[_Channel], n: int) -> Normal:
             total.vector.at[columns].add(weighted.T @ r),
         )
     return everywhere(total)
+
+
+@eqx.filter_jit
+def _scores(channels: list[Channel], n: int, blocks: int) -> Scores:
+    score, by_channel = jnp.zeros((blocks, n)), []
+    for channel in channels:
+        fields = channel.colour, channel.residual, channel.weight, channel.rows
+        colour, r, weight, rows = (x.astype(float) for x in fields)
+        columns, by_block = np.asarray(channel.columns, np.int32), partial(jax.ops.segment_sum, num_segments=blocks)
+        score = score.at[:, columns].add(by_block(rows * (weight * r)[:, None], channel.block))
+        # What sees no unknown, as the empty background, says nothing of how well they explain the rest.
+        live = jnp.where(jnp.any(rows != 0, axis=1), weight, 0)
+        moved = lambda by, rows=rows, columns=columns: jnp.zeros(n).at[columns].add(by @ rows)
+        sums = live, live * r**2, live * colour**2, (live * r) ** 2
+        by_channel.append(
+            (by_block(live * r, channel.block), moved(weight), moved(weight * colour), jnp.stack([jnp.sum(x) for x in sums]))
+        )
+    residual, offset, gain, sums = (jnp.stack(parts) for parts in zip(*by_channel, strict=True))
+    return everywhere(Scores(score, residual, offset, gain, sums))
 
 
 def _jacobian(

@@ -30,6 +30,8 @@ from jvr.types import Scalar, Triple
 
 # Rays whose rows are held at a time; smaller batches lose the second core, larger ones fall out of the cache.
 CHUNK = 16_384
+# Blocks of neighbouring pixels, by which misfit is told from noise: rows of as many sums as there are unknowns are held for all of them.
+LEAST_SIDE, MOST_BLOCKS = 8, 4096
 
 
 class WorldRays(NamedTuple):
@@ -45,13 +47,14 @@ class Observations(eqx.Module):
     """World rays with the colour that each should have, `(tiles, rays)`: as many tiles for each device, its share; in each share, rays
     that cross more of the volume come first. A fit holds them once, and takes its tiles out of them within its programs.
 
-    `weight` is 0 for the rays that fill up a share. `start` is where a ray's kept samples begin in what its device holds, all 0 without
-    any.
+    `weight` is 0 for the rays that fill up a share. `block` numbers the squares of neighbouring pixels. `start` is where a ray's kept
+    samples begin in what its device holds, all 0 without any.
     """
 
     rays: WorldRays
     target: Float[Array, "*tiles rays 3"]
     weight: Float[Array, "*tiles rays"]
+    block: Int[Array, "*tiles rays"]
     start: Int[Array, "*tiles rays"]
 
     @property
@@ -174,8 +177,24 @@ def observe(
     placed = [on_devices(np.concatenate(columns.pop(0))[pixel]) for _ in range(len(columns))]
     target = on_devices(np.concatenate([image.reshape(-1, 3) for image in images])[pixel])
     weight = np.where(rank < order.size, np.concatenate([w.ravel() for w in weights])[pixel], 0)
+    block = on_devices(_blocks(cameras)[pixel])
     start = on_devices(np.zeros(rank.shape, np.int32))
-    return Observations(jax.tree.unflatten(structure, placed), target, on_devices(weight), start)
+    return Observations(jax.tree.unflatten(structure, placed), target, on_devices(weight), block, start)
+
+
+def _blocks(cameras: Sequence[AbstractCamera]) -> Int[np.ndarray, "pixels"]:
+    """For each pixel of all images the number of its block: squares of `LEAST_SIDE` pixels a side, or of twice that and so on, so that
+    there are at most `MOST_BLOCKS`."""
+    side = LEAST_SIDE
+    while sum(-(-c.height // side) * -(-c.width // side) for c in cameras) > MOST_BLOCKS:
+        side *= 2
+    blocks, first = [], 0
+    for camera in cameras:
+        row, column = np.divmod(np.arange(camera.height * camera.width, dtype=np.int32), camera.width)
+        across = -(-camera.width // side)
+        blocks.append(first + row // side * across + column // side)
+        first += -(-camera.height // side) * across
+    return np.concatenate(blocks).astype(np.int32)
 
 
 @jax.jit

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.fitting.bijectors import AbstractBijector, bijector_of
-from jvr.model.parameters import is_by_channel, parameter, range_at
+from jvr.model.parameters import is_by_channel, is_ordered, parameter, range_at
 from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range
 from jvr.model.scene import Scene
 from jvr.types import Scalar
@@ -31,6 +31,7 @@ class Unknowns(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     ranges: tuple[Range, ...] = eqx.field(static=True)
     by_channel: tuple[bool, ...] = eqx.field(static=True)
+    ordered: tuple[bool, ...] = eqx.field(static=True)
     bijectors: tuple[AbstractBijector, ...]
 
     def among(self, model: ExposedModel, select: Callable[[ExposedModel], Any]) -> frozenset[int]:
@@ -112,9 +113,9 @@ def choose_unknowns(
         return bijector_of(declared, leaves[index][1], voxel, bounds)
 
     ranges = tuple(range_at(model, leaves[i][0]) for i in indices)
-    by_channel = tuple(is_by_channel(model, leaves[i][0]) for i in indices)
+    by_channel, ordered = (tuple(told(model, leaves[i][0]) for i in indices) for told in (is_by_channel, is_ordered))
     chosen = tuple(t or default(*known) for t, known in zip(given, zip(names, indices, ranges, strict=True), strict=True))
-    return Unknowns(indices, names, ranges, by_channel, chosen)
+    return Unknowns(indices, names, ranges, by_channel, ordered, chosen)
 
 
 def leaves_by_name(scene: Scene) -> dict[str, Array]:

@@ -21,7 +21,7 @@ class ByValue(AbstractByScalar):
     """
 
     positions: Float[Array, "n"] = parameter(INCREASING, doc="in the data's own units")
-    values: Float[Array, "n"] = parameter(doc="one for each position")
+    values: Float[Array, "n"] = parameter(ordered=True, doc="one for each position")
 
     def __init__(self, positions: ArrayLike, values: ArrayLike):
         assign(self, positions=positions, values=values)

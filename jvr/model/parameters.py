@@ -56,6 +56,8 @@ class Parameter:
       methods along a ray see numbers alone (`jvr.model.by_value.at_value`), which no annotation of one field says to a type checker.
     - `by_channel`: whether, where the last axis is colour, each of its channels acts on that channel of a picture alone, as those of light
       do. A fit then takes one forward derivative for all three.
+    - `ordered`: whether entries along the first axis follow each other by value, so that what lies between two of them is meant to be
+      between theirs. What images do not determine is continued along it.
     - `least`: entries that a named axis has at least.
     - `most`: the largest number that a file may ask for, where a constructor takes larger ones: a slip of the pen must not take all memory.
     """
@@ -67,6 +69,7 @@ class Parameter:
     shapes: tuple[Shape, ...] | None = None
     by_scalar: bool = False
     by_channel: bool = False
+    ordered: bool = False
     least: int = 1
     most: float | int = math.inf
 
@@ -84,10 +87,11 @@ def parameter(
     shapes: tuple[Shape, ...] | None = None,
     by_scalar: bool = False,
     by_channel: bool = False,
+    ordered: bool = False,
     least: int = 1,
 ) -> Any:
     """A field that is an array, or another part of a scene; see `Parameter`."""
-    return eqx.field(metadata={"parameter": Parameter(within, doc, unit, hint, shapes, by_scalar, by_channel, least)})
+    return eqx.field(metadata={"parameter": Parameter(within, doc, unit, hint, shapes, by_scalar, by_channel, ordered, least)})
 
 
 def choice(within: Range = ANY, *, doc: str, unit: str = "", hint: str = "", most: float | int = math.inf, **default: Any) -> Any:
@@ -139,6 +143,11 @@ def range_at(tree: Any, path: tuple[Any, ...]) -> Range:
 def is_by_channel(tree: Any, path: tuple[Any, ...]) -> bool:
     """Whether each colour channel of the leaf of `tree` at a path acts on that channel of a picture alone."""
     return next((about.by_channel for about in _declared_at(tree, path)), False)
+
+
+def is_ordered(tree: Any, path: tuple[Any, ...]) -> bool:
+    """Whether entries of the leaf of `tree` at a path follow each other along its first axis."""
+    return next((about.ordered for about in _declared_at(tree, path)), False)
 
 
 def _declared_at(tree: Any, path: tuple[Any, ...]) -> list[Parameter]:

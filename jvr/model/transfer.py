@@ -23,9 +23,9 @@ class Classified(NamedTuple):
     sigma_t: Channels
 
 
-def extinction() -> Any:
+def extinction(*, ordered: bool) -> Any:
     """The declaration of an extinction for each entry, grey or coloured."""
-    return parameter(EXTINCTION, shapes=(("n",), ("n", 3)), doc="extinction", unit="1 / mm")
+    return parameter(EXTINCTION, shapes=(("n",), ("n", 3)), ordered=ordered, doc="extinction", unit="1 / mm")
 
 
 class AbstractTransfer(AbstractPart):
@@ -92,8 +92,8 @@ class LinearTransfer(AbstractTable):
     """
 
     positions: Float[Array, "n"] = parameter(INCREASING, least=2, doc="in the data's own units")
-    rgb: Float[Array, "n 3"] = parameter(COLOUR, doc="red, green, blue, linear")
-    sigma_t: Float[Array, "..."] = extinction()
+    rgb: Float[Array, "n 3"] = parameter(COLOUR, ordered=True, doc="red, green, blue, linear")
+    sigma_t: Float[Array, "..."] = extinction(ordered=True)
 
     def __init__(self, positions: ArrayLike, rgb: ArrayLike, sigma_t: ArrayLike):
         assign(self, positions=positions, rgb=rgb, sigma_t=sigma_t)
@@ -122,8 +122,8 @@ class LutTransfer(AbstractTable):
     differentiable. **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
     """
 
-    rgb: Float[Array, "n 3"] = parameter(COLOUR, least=2, doc="red, green, blue, linear")
-    sigma_t: Float[Array, "..."] = extinction()
+    rgb: Float[Array, "n 3"] = parameter(COLOUR, ordered=True, least=2, doc="red, green, blue, linear")
+    sigma_t: Float[Array, "..."] = extinction(ordered=True)
     domain: Float[Array, "2"] = parameter(INCREASING, doc="low < high in the data's own units")
 
     def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike):
@@ -159,7 +159,7 @@ class GaussianTransfer(AbstractTransfer):
 
     center: Float[Array, "n"] = parameter(doc="in the data's own units")
     width: Float[Array, "n"] = parameter(POSITIVE, doc="in the data's own units")
-    height: Float[Array, "..."] = extinction()
+    height: Float[Array, "..."] = extinction(ordered=False)
     rgb: Float[Array, "n 3"] = parameter(COLOUR, doc="red, green, blue, linear")
 
     def __init__(self, center: ArrayLike, width: ArrayLike, height: ArrayLike, rgb: ArrayLike):

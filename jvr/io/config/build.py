@@ -213,6 +213,7 @@ def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:
         "priors": _priors(config, fit),
         "exposure": fit.exposure,
         "keep_samples": fit.keep_samples,
+        "smooth_undetermined": fit.smooth_undetermined,
         "max_steps": fit.max_steps,
     }
 

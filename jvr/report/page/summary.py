@@ -12,7 +12,7 @@ from jvr.report.plots.pictures import decibels
 from jvr.types import Outcome
 
 if TYPE_CHECKING:
-    from jvr.fitting.fit import FitResult
+    from jvr.fitting.fit import FitResult, FitStats
 
 
 def verdict(result: "FitResult", targets: Sequence[Any], fitted: Sequence[Any]) -> str:
@@ -95,4 +95,25 @@ def identifiability(result: "FitResult", transfer: AbstractTransfer) -> str:
         parts.append(f"<p>{escape(least_determined_in_words(stats.worst, transfer))}</p>")
         share = "; ".join(f"{name} {coefficient:+.2f}" for name, coefficient in stats.worst)
         parts.append(f'<p class="soft">Largest coefficients, each unknown in units of its own sensitivity: {escape(share)}.</p>')
-    return "".join(parts)
+    return "".join((*parts, _smoothed(stats), _misfit(stats)))
+
+
+def _smoothed(stats: "FitStats") -> str:
+    if not stats.smoothed:
+        return ""
+    listed = " and ".join(f"{count} of {escape(name)}" for name, count in stats.smoothed)
+    return (
+        f"<p>What the images (nearly) leave open was continued smoothly from the neighbouring entries, {listed}: that adds at most 0.01 dB "
+        "of error, and these values mean no more than their standard errors say.</p>"
+    )
+
+
+def _misfit(stats: "FitStats") -> str:
+    if not stats.structured:
+        return ""
+    return (
+        "<p>Neighbouring pixels are wrong in the same way: sums of residuals over squares of pixels vary "
+        f"{stats.design_effect:.3g} times as much as those of noise would. This model does not explain the images, whatever its unknowns "
+        "(another renderer's sampling, a camera's blur, light or shading that it lacks, a background); standard errors allow for "
+        "that, and suppose that unknowns have absorbed an error of brightness and of contrast as large as the residuals.</p>"
+    )

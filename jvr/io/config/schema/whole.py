@@ -173,6 +173,7 @@ class FitTable(Table):
     priors: PriorsTable = PriorsTable()
     exposure: bool = False
     keep_samples: Annotated[bool | int, BeforeValidator(_keep)] = True
+    smooth_undetermined: bool = True
     held_out: Annotated[int | list[int], BeforeValidator(_held_out)] = 0
 
     @model_validator(mode="after")
