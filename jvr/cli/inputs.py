@@ -100,7 +100,7 @@ def inputs_of(config: "Config") -> list[Path]:
         elif isinstance(value, list):
             for i, part in enumerate(value):
                 walk(part, f"{key}.{i}")
-        elif isinstance(value, str) and re.search(r"(^|\.)path$|^fit\.images\.", key):
+        elif isinstance(value, str) and re.search(r"(^|\.)path$|^fit\.(images|weights)\.", key):
             named.append((value, key))
 
     walk(config.data, "")

@@ -87,7 +87,7 @@ def _layers(headers: list[dict[str, Any]]) -> dict[str, Layer]:
         groups: dict[str, dict[str, str]] = {}
         for channel in [] if _is_deep(header) else header["channels"]:
             prefix, _, role = channel.name.rpartition(".")
-            groups.setdefault(prefix, {})[ROLES.get(role.lower(), role.upper())] = channel.name
+            groups.setdefault(prefix, {})[ROLES.get(role.lower()) or role.upper()] = channel.name
         own = str(header.get("name") or "")
         for prefix, channels in groups.items():
             roles = _colours_among(set(channels))
