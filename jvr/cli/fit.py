@@ -13,7 +13,7 @@ import numpy as np
 
 from jvr.cli.beforehand import Beforehand
 from jvr.cli.folder import CHECKPOINT, PAGE, RESULT, TRANSFER, alone_in, check_results, results_in
-from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by_jvr
+from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by_jvr, warnings_as_lines
 from jvr.cli.runtime import nested, plain, progress, provenance, start_jax
 from jvr.cli.signals import INTERRUPTED, Terminated, said
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
@@ -70,7 +70,8 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
     if not resume:
         checkpoint.unlink(missing_ok=True)
     try:
-        return fit(job.scene, job.cameras, job.targets, **keywords)
+        with warnings_as_lines():
+            return fit(job.scene, job.cameras, job.targets, **keywords)
     except (KeyboardInterrupt, Terminated) as error:
         kept = f"{checkpoint} is kept, --resume goes on from it" if checkpoint.exists() else "no step was finished"
         status = error.status if isinstance(error, Terminated) else INTERRUPTED

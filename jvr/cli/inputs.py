@@ -32,14 +32,21 @@ class Interrupted(Exception):
 @contextlib.contextmanager
 def reading() -> Iterator[None]:
     """A stage that only reads and checks input: what it raises is the input's fault. Warnings become lines on stderr."""
-    with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *rest, **more: explain(f"warning: {message}", 0)
+    with warnings_as_lines():
         try:
             yield
         except OSError as error:
             raise BadInput(system_problem(error)) from error
         except (ValueError, TypeError) as error:
             raise BadInput(str(error)) from error
+
+
+@contextlib.contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """Warnings are one line each on stderr, without the place in the program that they come from."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *rest, **more: explain(f"warning: {message}", 0)
+        yield
 
 
 def refused_by_jvr(error: Exception) -> bool:

@@ -9,7 +9,7 @@ from jvr.fitting.bijectors import Identity, Softplus
 from jvr.fitting.problem import Problem
 from jvr.fitting.targets import Targets, written
 from jvr.fitting.unknowns import ExposedModel, Unknowns
-from jvr.model.optical import EmissionOnly
+from jvr.model.optical import AbsorptionOnly, EmissionAbsorption
 from jvr.model.transfer import AbstractTable
 from jvr.pictures import srgb_from_linear
 
@@ -40,9 +40,7 @@ def say_what_is_out_of_reach(problem: Problem, targets: Targets) -> None:
 
 def _too_bright(problem: Problem, targets: Targets) -> str | None:
     highest = _brightest(problem)
-    counted = [np.ones(image.shape[:2], bool) for image in targets.images] if targets.weights is None else targets.weights
-    bright = [image[weight > 0].max(axis=-1) for image, weight in zip(targets.images, counted, strict=True)]
-    bright = np.concatenate(bright)
+    bright = np.concatenate([image[known].max(axis=-1) for image, known in zip(targets.images, targets.counted, strict=True)])
     if highest is None or not bright.max() > BRIGHTER * highest:
         return None
     return (
@@ -54,7 +52,7 @@ def _too_bright(problem: Problem, targets: Targets) -> str | None:
 def _brightest(problem: Problem) -> float | None:
     """The most that a pixel can have, `None` where nothing bounds it: a mean of colours of the table and the background."""
     scene, unknowns = problem.model.scene, problem.unknowns
-    bounded = isinstance(scene.transfer, AbstractTable) and not isinstance(scene.optical, EmissionOnly)
+    bounded = isinstance(scene.transfer, AbstractTable) and isinstance(scene.optical, EmissionAbsorption | AbsorptionOnly)
     if not bounded or scene.shows_light or problem.model.exposure is not None:
         return None
     highest = 0.0
@@ -69,8 +67,7 @@ def _brightest(problem: Problem) -> float | None:
 
 def _other_background(behind: Float[np.ndarray, "3"], targets: Targets) -> str | None:
     """What the targets have in all their corners, or in the upper and in the lower ones, where that is not what is `behind`."""
-    weights = targets.weights or [np.ones(image.shape[:2]) for image in targets.images]
-    corners = [_corners(image, weight) for image, weight in zip(targets.images, weights, strict=True)]
+    corners = [_corners(image, known) for image, known in zip(targets.images, targets.counted, strict=True)]
     above, below = (np.array([colour for pair in corners for colour in pair[k]]) for k in (0, 1))
     if not (len(above) and len(below)):
         return None
@@ -86,13 +83,13 @@ def _other_background(behind: Float[np.ndarray, "3"], targets: Targets) -> str |
     return f"the target images seem to have the background {written(top)}, linear, {scene}: give background={written(top)}"
 
 
-def _corners(image: np.ndarray, weight: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _corners(image: np.ndarray, known: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The middle colours of the upper two corners and of the lower two, of each that counts."""
     rows, columns = (max(1, round(CORNER * n)) for n in image.shape[:2])
     found: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for place, vertical in zip(found, (slice(rows), slice(-rows, None)), strict=True):
         for horizontal in (slice(columns), slice(-columns, None)):
-            counted = image[vertical, horizontal][weight[vertical, horizontal] > 0]
+            counted = image[vertical, horizontal][known[vertical, horizontal]]
             place += [np.median(counted, axis=0)] if len(counted) else []
     return found
 

@@ -19,15 +19,20 @@ class Targets(NamedTuple):
     weights: list[np.ndarray] | None
 
     @property
+    def counted(self) -> list[np.ndarray]:
+        """Which pixels of each image count."""
+        return (
+            [np.ones(image.shape[:2], bool) for image in self.images] if self.weights is None else [w > 0 for w in self.weights]
+        )
+
+    @property
     def are_weighted(self) -> bool:
         """Whether some pixels count more than others."""
         return self.weights is not None and len(np.unique(np.concatenate([np.unique(weight) for weight in self.weights]))) > 1
 
     def marked(self) -> list[np.ndarray]:
         """The images with NaN for pixels that do not count."""
-        if self.weights is None:
-            return self.images
-        return [np.where(weight[..., None] > 0, image, np.nan) for image, weight in zip(self.images, self.weights, strict=True)]
+        return [np.where(known[..., None], image, np.nan) for image, known in zip(self.images, self.counted, strict=True)]
 
 
 def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "target image") -> list[np.ndarray]:
