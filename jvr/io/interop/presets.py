@@ -162,7 +162,7 @@ def _with_gradient(transfer: LinearTransfer, gradient: Curve, spacing: float | i
 def property_of(preset: Preset) -> VolumeProperty:
     """The description of a preset; what another program cannot hold is in its `lost`.
 
-    **Raises** `ValueError` for transfer functions that are neither tables nor Gaussians of the scalar, but for `jvr.GradientOpacity` of one.
+    **Raises** `ValueError` for transfer functions that are neither tables nor Gaussians of the scalar, and no `jvr.GradientOpacity` of one.
     """
     lost: dict[str, str] = {}
     transfer, gradient = preset.transfer, None
