@@ -135,11 +135,13 @@ def _codes(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
 
 
 def png_bytes(codes: UInt8[np.ndarray, "height width channels"]) -> bytes:
-    """A PNG file of 8-bit codes, RGB or RGBA."""
-    from PIL import Image
+    """A PNG file of 8-bit sRGB codes, RGB or RGBA, which says that they are."""
+    from PIL import Image, PngImagePlugin
 
-    buffer = io.BytesIO()
-    Image.fromarray(codes).save(buffer, format="PNG")
+    buffer, chunks = io.BytesIO(), PngImagePlugin.PngInfo()
+    # 0: for the eye, "perceptual".
+    chunks.add(b"sRGB", b"\0")
+    Image.fromarray(codes).save(buffer, format="PNG", pnginfo=chunks)
     return buffer.getvalue()
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from jvr.cli.beforehand import Beforehand
 from jvr.cli.folder import CHECKPOINT, PAGE, RESULT, TRANSFER, alone_in, check_results, results_in
-from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by_jvr
+from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by_jvr, warnings_as_lines
 from jvr.cli.runtime import nested, plain, progress, provenance, start_jax
 from jvr.cli.signals import INTERRUPTED, Terminated, said
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
@@ -70,7 +70,8 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
     if not resume:
         checkpoint.unlink(missing_ok=True)
     try:
-        return fit(job.scene, job.cameras, job.targets, **keywords)
+        with warnings_as_lines():
+            return fit(job.scene, job.cameras, job.targets, **keywords)
     except (KeyboardInterrupt, Terminated) as error:
         kept = f"{checkpoint} is kept, --resume goes on from it" if checkpoint.exists() else "no step was finished"
         status = error.status if isinstance(error, Terminated) else INTERRUPTED
@@ -125,8 +126,9 @@ def _write_views(folder: Path, name: str, target: np.ndarray, fitted: np.ndarray
 
     for kind, image in (("target", target), ("fitted", fitted), ("difference", fitted - target)):
         write_image(folder / f"{kind}_{name}.exr", image)
-        # A PNG holds no negative light: there the size of the difference is shown, ten times enlarged.
-        write_image(folder / f"{kind}_{name}.png", 10 * np.abs(image) if kind == "difference" else image)
+        # A PNG holds no negative light: there the size of the difference is shown, ten times enlarged, and black for what is not known.
+        shown = np.where(np.isfinite(image), image, 0)
+        write_image(folder / f"{kind}_{name}.png", 10 * np.abs(shown) if kind == "difference" else shown)
 
 
 def _write_page(folder: Path, config: Config, job: FitJob, result: Any, fitted: list[np.ndarray]) -> None:
@@ -176,12 +178,13 @@ def _report(config: Config, job: FitJob, result: Any, pictures: Any) -> dict[str
 
 
 def _scores(targets: Any, fitted: Any) -> dict[str, Any]:
-    """PSNR (of radiance 1) of each view and of all pixels together, and SSIM of each view; `null` for equal images."""
-    from jvr.rendering.measure import similarity
+    """PSNR (of radiance 1) of each view and of all pixels together, and SSIM of each view; `null` for equal images. Where a target is not
+    finite it is not known."""
+    from jvr.rendering.measure import psnr, similarity
 
-    decibels = lambda error: plain(-10 * np.log10(error)) if error > 0 else None
-    squares = [float(np.mean(np.square(f.astype(np.float64) - t))) for t, f in zip(targets, fitted, strict=True)]
-    ssim = [similarity(target, found) for target, found in zip(targets, fitted, strict=True)]
-    pixels = [target.size for target in targets]
-    mean = decibels(float(np.average(squares, weights=pixels))) if squares else None
-    return {"psnr": [decibels(s) for s in squares], "mean_psnr": mean, "ssim": ssim}
+    flat = lambda images: np.concatenate([np.ravel(image) for image in images])
+    return {
+        "psnr": [plain(psnr(*pair)) for pair in zip(targets, fitted, strict=True)],
+        "mean_psnr": plain(psnr(flat(targets), flat(fitted))) if len(targets) else None,
+        "ssim": [plain(similarity(*pair)) for pair in zip(targets, fitted, strict=True)],
+    }

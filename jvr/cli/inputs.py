@@ -32,14 +32,21 @@ class Interrupted(Exception):
 @contextlib.contextmanager
 def reading() -> Iterator[None]:
     """A stage that only reads and checks input: what it raises is the input's fault. Warnings become lines on stderr."""
-    with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *rest, **more: explain(f"warning: {message}", 0)
+    with warnings_as_lines():
         try:
             yield
         except OSError as error:
             raise BadInput(system_problem(error)) from error
         except (ValueError, TypeError) as error:
             raise BadInput(str(error)) from error
+
+
+@contextlib.contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """Warnings are one line each on stderr, without the place in the program that they come from."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *rest, **more: explain(f"warning: {message}", 0)
+        yield
 
 
 def refused_by_jvr(error: Exception) -> bool:
@@ -100,7 +107,7 @@ def inputs_of(config: "Config") -> list[Path]:
         elif isinstance(value, list):
             for i, part in enumerate(value):
                 walk(part, f"{key}.{i}")
-        elif isinstance(value, str) and re.search(r"(^|\.)path$|^fit\.images\.", key):
+        elif isinstance(value, str) and re.search(r"(^|\.)path$|^fit\.(images|weights)\.", key):
             named.append((value, key))
 
     walk(config.data, "")

@@ -23,14 +23,16 @@ from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.minimisers import OptimistixSolver
 from jvr.fitting.objective import check_derivatives
-from jvr.fitting.observations import Observations, check_images, check_settings, is_mostly_empty, keep_samples, observe
+from jvr.fitting.observations import Observations, check_settings, is_mostly_empty, keep_samples, observe
 from jvr.fitting.problem import Problem
+from jvr.fitting.reach import known_background, say_what_is_out_of_reach
 from jvr.fitting.solvers import AbstractSolver
-from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns
+from jvr.fitting.targets import Targets, targets_of
+from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns, selected
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
-from jvr.rendering.measure import similarity
+from jvr.rendering.measure import psnr, similarity
 from jvr.rendering.render import render
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
@@ -142,13 +144,14 @@ def fit(
     **Arguments:**
 
     - `scene`: where the fit starts; what is not unknown stays as it is.
-    - `cameras`, `images`: one target image `(height, width, 3)`, linear radiance, for each camera.
+    - `cameras`, `images`: one target image `(height, width, 3)`, linear radiance, for each camera, each of its own size. Pixels that are
+      not finite have weight 0. Images `(height, width, 4)`, light over black and alpha, are put over the scene's background.
     - `unknowns`: picks arrays out of the scene by their place, for example `lambda s: (s.transfer.rgb, s.transfer.sigma_t)`.
     - `solver`: `None` is `jvr.LevenbergMarquardt()`; also `jvr.GaussNewton()`, `jvr.Dogleg()`, `jvr.LBFGSB()`, or any minimiser or
       least-squares solver of Optimistix.
     - `loss`: `jvr.SquaredError()`, `jvr.Huber()`, `jvr.AbsoluteError()` or, for solvers that use gradients alone, `jvr.DSSIM()`.
     - `priors`: penalties added to the mean loss; `transforms`: one for each unknown array, see `jvr.fitting.unknowns`.
-    - `weights`: one `(height, width)` array for each image, not negative.
+    - `weights`: one `(height, width)` array for each image, not negative, such as masks.
     - `exposure`: also fit the factor between rendered and target radiance.
     - `held_out`: `(cameras, images)` that are only compared with at the end.
     - `keep_samples`: keep the resampled values along all rays (2 bytes each) while the volume is not unknown, so that no step touches
@@ -163,29 +166,35 @@ def fit(
     renderer's sampling, a camera's blur) they are those of a sandwich estimate, see `jvr.fitting.identifiability`. `settings.adjoint` plays
     no part: each solver has its own.
 
+    What the targets show and no values of the unknowns can is said: another background than the scene's, light that its colours do not
+    reach, a camera that sees nothing of the volume.
+
     **Raises** `ValueError` for images that do not fit the cameras, unknowns that are not arrays of the scene, too many unknowns for
-    a least-squares solver, a loss that the solver cannot use, or an integrator whose radiance has no derivative. A non-finite value ends
-    the fit with that outcome and the last good iterate.
+    a least-squares solver, a loss that the solver cannot use, cameras that all miss the volume, or an integrator whose radiance has no
+    derivative. A non-finite value ends the fit with that outcome and the last good iterate.
     """
     began = time.perf_counter()
     solver = _as_solver(solver)
-    targets = check_images(cameras, images)
     check_settings(settings)
     scene = scene.current()
     model = ExposedModel(scene, jnp.ones(()) if exposure else None)
     chosen = _choose(model, unknowns, transforms, solver)
     model = _without_stale(model, chosen)
     scene, chosen = model.scene, _choose(model, unknowns, transforms, solver)
+    behind = known_background(model, chosen)
+    targets, weights = given = targets_of(cameras, images, weights, behind)
+    held = None if held_out is None else (held_out[0], targets_of(*held_out, None, behind, "held-out image"))
     start = chosen.model_from_unconstrained(model, chosen.unconstrained_from_model(model))
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
-    forwards = _check(problem, solver)
+    forwards = _check(problem, solver, given)
+    say_what_is_out_of_reach(problem, given)
 
     problem, observations = _keep(problem, observe(scene, cameras, targets, weights, settings), keep_samples)
     check_derivatives(problem, observations, forwards=forwards)
     evaluator = Evaluator(problem, observations, cameras, targets)
     mark = checkpoints.fingerprint(problem, (cameras, targets, weights), solver) if checkpoint else {}
     # The observations hold them.
-    del targets
+    del targets, given
     state, history = solver.init(evaluator.functions, chosen.unconstrained_from_model(model)), []
     if checkpoint and resume and Path(checkpoint).exists():
         state, rows = checkpoints.load(Path(checkpoint), state, mark)
@@ -223,7 +232,7 @@ def fit(
         design_effect=known.design_effect,
         smoothed=_counted(chosen, model, quiet),
         worst=_least_determined(chosen, model, known),
-        held_out=() if held_out is None else _compare(found, settings, *held_out),
+        held_out=() if held is None else _compare(found, settings, *held),
     )
     return FitResult(
         scene=found.scene,
@@ -248,7 +257,7 @@ def _as_solver(solver: Any) -> AbstractSolver:
 
 def _choose(model: ExposedModel, unknowns: Callable[[Scene], Any], transforms: Any, solver: AbstractSolver) -> Unknowns:
     """The scene's unknowns and then the exposure."""
-    select = lambda m: (unknowns(m.scene), m.exposure)
+    select = lambda m: (selected(unknowns, m.scene), m.exposure)
     if transforms is not None:
         transforms = (*transforms, *([None] if model.exposure is not None else []))
     return choose_unknowns(model, select, transforms, solver.bounds)
@@ -266,7 +275,7 @@ def _without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
     return model
 
 
-def _check(problem: Problem, solver: AbstractSolver) -> bool:
+def _check(problem: Problem, solver: AbstractSolver, given: Targets) -> bool:
     """Refuses combinations that cannot work; whether derivatives are taken in forward mode."""
     is_least_squares = isinstance(solver, ChunkedLeastSquares) or (
         isinstance(solver, OptimistixSolver) and isinstance(solver.solver, optx.AbstractLeastSquaresSolver)
@@ -274,6 +283,10 @@ def _check(problem: Problem, solver: AbstractSolver) -> bool:
     if is_least_squares and isinstance(problem.loss, DSSIM):
         raise ValueError(
             "DSSIM is not a sum over pixels and has no least-squares form: use solver=optimistix.BFGS(rtol=1e-6, atol=1e-8)"
+        )
+    if isinstance(problem.loss, DSSIM) and given.are_weighted:
+        raise ValueError(
+            "DSSIM compares whole images: leave weights and pixels that are not finite out, or use loss=jvr.AbsoluteError()"
         )
     if (
         isinstance(solver, OptimistixSolver)
@@ -334,18 +347,12 @@ def _counted(chosen: Unknowns, model: ExposedModel, which: np.ndarray) -> tuple[
 
 
 def _compare(
-    found: ExposedModel, settings: Settings, cameras: Sequence[AbstractCamera], images: Any
+    found: ExposedModel, settings: Settings, cameras: Sequence[AbstractCamera], targets: Targets
 ) -> tuple[tuple[float, float], ...]:
     """PSNR and SSIM of views that took no part in the fit."""
-    from skimage.metrics import peak_signal_noise_ratio
-
     exposure = 1.0 if found.exposure is None else float(found.exposure)
-    scores = []
-    for camera, target in zip(cameras, check_images(cameras, images, "held-out image"), strict=True):
-        rendered = exposure * np.asarray(render(found.scene, camera, settings).rgb)
-        psnr = peak_signal_noise_ratio(target, rendered, data_range=1.0)
-        scores.append((float(psnr), similarity(target, rendered)))
-    return tuple(scores)
+    pictures = [exposure * np.asarray(render(found.scene, camera, settings).rgb) for camera in cameras]
+    return tuple((psnr(*pair), similarity(*pair)) for pair in zip(targets.marked(), pictures, strict=True))
 
 
 @contextlib.contextmanager

@@ -9,8 +9,9 @@ import numpy as np
 
 from jvr.fitting.losses import SquaredError
 from jvr.fitting.normal_equations import normal_equations
-from jvr.fitting.observations import check_images, observe
+from jvr.fitting.observations import observe
 from jvr.fitting.problem import Problem
+from jvr.fitting.targets import check_images
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt16
 
 from jvr.execution.devices import everywhere, on_devices, over_rays, shares
+from jvr.fitting.targets import check_weights
 from jvr.march.fields import MISSING, CachedSamples, VoxelField
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
@@ -21,7 +22,6 @@ from jvr.model.exact import Exact
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
 from jvr.numerics import two_sum
-from jvr.pictures import as_radiance
 from jvr.rendering.integrator import AbstractRayIntegrator
 from jvr.rendering.medium import Prepared, medium, occupancy, prepare
 from jvr.rendering.settings import Settings
@@ -98,44 +98,6 @@ class Samples(eqx.Module):
         return self.stored.size * self.stored.dtype.itemsize
 
 
-def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "target image") -> list[np.ndarray]:
-    """The images as float arrays, one for each camera and of its size.
-
-    **Raises** `ValueError` where their number or a size differs, a pixel is not finite, or they hold codes in place of radiance.
-    """
-    if isinstance(cameras, AbstractCamera) or getattr(images, "ndim", 4) == 3:
-        raise TypeError("cameras and images must be sequences of as many: put a single one in brackets, as [camera] and [image]")
-    images = [as_radiance(image, f"{name} {i}").astype(jnp.result_type(float)) for i, image in enumerate(images)]
-    if len(images) != len(cameras) or not images:
-        raise ValueError(
-            f"there are {len(images)} images for {len(cameras)} cameras: give one image for each camera, and at least one"
-        )
-    for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
-        if image.shape == (camera.height, camera.width, 4):
-            raise ValueError(f"{name} {i} has four channels: give light over the scene's background, (height, width, 3)")
-        if image.shape != (camera.height, camera.width, 3):
-            raise ValueError(
-                f"{name} {i} has shape {image.shape}, its camera sees {(camera.height, camera.width, 3)}: resize the image or the camera"
-            )
-        if not np.all(np.isfinite(image)):
-            raise ValueError(
-                f"{name} {i} has {np.sum(~np.isfinite(image))} values that are not finite: give them weight 0 and replace them"
-            )
-        # A photograph that was only converted to floating point.
-        if image.max() >= 16 and np.array_equal(image, np.rint(image)):
-            raise ValueError(
-                f"{name} {i} holds whole numbers up to {image.max():g}, radiance has white at 1: "
-                "convert codes by jvr.linear_from_srgb(codes / 255)"
-            )
-        if image.max() >= 16 and np.mean(image > 1) > 0.5:
-            warnings.warn(
-                f"{name} {i} goes up to {image.max():g} and is mostly brighter than white, 1: are these codes?", stacklevel=3
-            )
-        if count := np.count_nonzero(image < 0):
-            warnings.warn(f"{name} {i} has {count:,} negative values, which no scene gives: is it a difference?", stacklevel=3)
-    return images
-
-
 def check_settings(settings: Settings) -> None:
     """**Raises** `ValueError` for settings that fits do not support."""
     integrator, remedy = settings.sampling, "leave Settings(sampling=...) at jvr.Uniform()"
@@ -158,13 +120,15 @@ def observe(
     """All pixels of all images as observations, in tiles of at most `chunk` rays, `CHUNK` without it. Sorted by how much of the volume they
     cross, rays are dealt out in turn to the devices.
 
-    **Raises** `ValueError` for settings that fits do not support.
+    **Raises** `ValueError` for settings that fits do not support, and where no ray meets the volume.
     """
     check_settings(settings)
-    weights = _check_weights(cameras, weights, images[0].dtype)
+    weights = check_weights(cameras, weights, images[0].dtype)
     # Compiled for all cameras of one size and kind.
     rays = [_rays(scene, camera) for camera in cameras]
-    length = np.concatenate([np.asarray(inside(scene, one).length) for one in rays])
+    lengths = [np.asarray(inside(scene, one).length) for one in rays]
+    _check_views(lengths, scene)
+    length = np.concatenate(lengths)
     order = np.argsort(-length, kind="stable").astype(np.int32)
     chunk = min(chunk or CHUNK, -(-order.size // shares()))
     together = chunk * shares()
@@ -275,6 +239,20 @@ def observed_medium(tile: Observations, samples: Samples | None, prepared: Prepa
     return through if samples is None else through._replace(field=samples.along(tile.start))
 
 
+def _check_views(lengths: Sequence[np.ndarray], scene: Scene) -> None:
+    """**Raises** `ValueError` where no ray of any camera meets the volume; a camera whose rays all miss it is named."""
+    blind = [i for i, length in enumerate(lengths) if not np.any(length > 0)]
+    center = ", ".join(f"{c:.4g}" for c in np.asarray(scene.volume.center))
+    where = f"the volume is around ({center}), with a radius of {float(scene.volume.radius):.4g}: check their poses, and clipping"
+    if len(blind) == len(lengths):
+        raise ValueError(f"no camera sees the volume; {where}")
+    if blind:
+        named = ", ".join(map(str, blind))
+        warnings.warn(
+            f"cameras that see nothing of the volume, so that their images say nothing of it: {named}; {where}", stacklevel=4
+        )
+
+
 @jax.jit
 def _segments(scene: Scene, observations: Observations, dt: Scalar) -> Int[Array, "tiles"]:
     """Of the longest ray of each tile."""
@@ -314,17 +292,3 @@ def _resample(
         return jax.lax.fori_loop(0, count, one, stored)
 
     return over_rays(share, (scene, place, dt, low, scale), (stored, observations))
-
-
-def _check_weights(cameras: Sequence[AbstractCamera], weights: Sequence[Any] | None, dtype: Any) -> list[np.ndarray]:
-    if weights is None:
-        return [np.ones((camera.height, camera.width), dtype) for camera in cameras]
-    arrays = [np.asarray(weight, dtype) for weight in weights]
-    if len(arrays) != len(cameras):
-        raise ValueError(f"there are weights for {len(arrays)} images and {len(cameras)} cameras: give one array for each")
-    for i, (camera, weight) in enumerate(zip(cameras, arrays, strict=True)):
-        if weight.shape != (camera.height, camera.width) or not np.all(np.isfinite(weight) & (weight >= 0)):
-            raise ValueError(
-                f"weights {i} must be {(camera.height, camera.width)}, finite and not negative; they have shape {weight.shape}"
-            )
-    return arrays

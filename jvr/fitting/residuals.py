@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jvr.fitting.observations import check_images
+from jvr.fitting.targets import check_images
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.render import render

@@ -100,7 +100,8 @@ def choose_unknowns(
     names = tuple(_name(leaves[i][0]) for i in indices)
     for name, index in zip(names, indices, strict=True):
         if not eqx.is_inexact_array(leaves[index][1]):
-            raise ValueError(f"{name} has integer voxels, which cannot be fitted: convert them to floating point first")
+            kind = jnp.asarray(leaves[index][1]).dtype
+            raise ValueError(f"{name} holds integers ({kind}), which have no derivative: convert them to floating point first")
     given = (None,) * len(indices) if transforms is None else tuple(transforms)
     if len(given) != len(indices):
         raise ValueError(
@@ -116,6 +117,35 @@ def choose_unknowns(
     by_channel, ordered = (tuple(told(model, leaves[i][0]) for i in indices) for told in (is_by_channel, is_ordered))
     chosen = tuple(t or default(*known) for t, known in zip(given, zip(names, indices, ranges, strict=True), strict=True))
     return Unknowns(indices, names, ranges, by_channel, ordered, chosen)
+
+
+def selected(unknowns: Any, scene: Scene) -> Any:
+    """What the function `unknowns` picks out of a scene.
+
+    **Raises** `TypeError` where it is no function, `ValueError` where it asks for what the scene has not.
+    """
+    if not callable(unknowns):
+        raise TypeError(
+            f"unknowns must be a function that picks arrays out of a scene, such as lambda s: s.transfer.rgb, not {unknowns!r:.60}"
+        )
+    try:
+        found = unknowns(scene)
+    except (AttributeError, LookupError) as error:
+        names = [name for name, leaf in leaves_by_name(scene).items() if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        raise ValueError(f"unknowns ask for what the scene has not ({error}): its arrays are {', '.join(names)}") from error
+    _refuse_none(found)
+    return found
+
+
+def _refuse_none(found: Any) -> None:
+    """A part that is not there would be left out of the fit without a word. Objects may hold nothing in some of their fields."""
+    if found is None:
+        raise ValueError(
+            "unknowns returned None: give the scene the part that is to be fitted, such as background=(0, 0, 0), or leave it out"
+        )
+    if type(found) in (tuple, list, dict):
+        for part in found.values() if isinstance(found, dict) else found:
+            _refuse_none(part)
 
 
 def leaves_by_name(scene: Scene) -> dict[str, Array]:

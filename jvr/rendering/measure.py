@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from numpy.lib.stride_tricks import sliding_window_view
 
 from jvr.march.differentiation import Replay
 from jvr.model.camera import AbstractCamera
@@ -136,20 +137,33 @@ def reference(
         return np.asarray(rgb), jax.tree.map(np.asarray, gradient)
 
 
+def psnr(true: np.ndarray, found: np.ndarray) -> float:
+    """Peak signal-to-noise ratio of two pictures, in decibels of radiance 1, over what is finite in `true`: the rest is not known."""
+    error = float(np.mean(np.square(np.asarray(found, np.float64) - true)[np.isfinite(true)]))
+    return -10 * np.log10(error) if error > 0 else np.inf
+
+
 def similarity(true: np.ndarray, found: np.ndarray, bright: float = 1.0) -> float:
     """Structural similarity (Wang et al. 2004) of two pictures `(height, width, 3)` with radiance 0 ... `bright`; 1 where they are equal.
 
-    Windows are 7 pixels wide, or the most that fit; pictures of less than 3 pixels are continued by their edge.
+    Windows are 7 pixels wide, or the most that fit; pictures of less than 3 pixels are continued by their edge. Where `true` is
+    not finite it is not known: windows with such pixels do not count, and where no others are left the answer is NaN.
     """
     from skimage.metrics import structural_similarity
 
+    known = np.all(np.isfinite(true), axis=-1)
+    if not np.any(known):
+        return np.nan
+    true = np.where(known[..., None], true, found)
     if np.array_equal(true, found):
         return 1.0
     missing = [(0, max(3 - n, 0)) for n in true.shape[:2]]
     true, found = (np.pad(image, [*missing, (0, 0)], mode="edge") for image in (true, found))
     window = min(7, (min(true.shape[:2]) - 1) // 2 * 2 + 1)
-    ssim: Any = structural_similarity(true, found, data_range=bright, channel_axis=-1, win_size=window)
-    return float(ssim)
+    ssim: Any = structural_similarity(true, found, data_range=bright, channel_axis=-1, win_size=window, full=True)
+    whole: Any = sliding_window_view(np.pad(known, missing, mode="edge"), (window, window)).all(axis=(2, 3))
+    of_windows = ssim[1][window // 2 :, window // 2 :][: whole.shape[0], : whole.shape[1]]
+    return float(np.mean(of_windows[whole], dtype=np.float64)) if np.any(whole) else np.nan
 
 
 def compared(truth: tuple[np.ndarray, Any], settings: Settings, found: TimedPicture) -> Measurement:

@@ -119,6 +119,62 @@ def test_one_fit_a_folder_at_a_time(tmp_path, capfd):
         pass
 
 
+SCREENSHOTS = """
+[volume]
+builtin = "demo"
+[[camera]]
+view = "front"
+width = 6
+height = 4
+[[camera]]
+view = "left"
+width = 5
+height = 5
+[settings]
+step = 16.0
+[fit]
+images = ["a.png", "b.png"]
+weights = ["mask_a.png", "mask_b.png"]
+max_steps = 1
+start = { entries = 3 }
+"""
+
+
+@pytest.mark.slow
+def test_pictures_of_others_are_fitted_by_what_is_said_of_them(tmp_path, capfd):
+    """Screenshots of two sizes with masks: what is assumed is one line, and what has changed since is another."""
+    codes = np.random.default_rng(0).integers(0, 256, (5, 6, 3)).astype(np.uint8)
+    mask = np.full((5, 6), 255, np.uint8)
+    mask[:2, :2] = 0
+    for name, rows, columns in (("a", 4, 6), ("b", 5, 5)):
+        Image.fromarray(codes[:rows, :columns]).save(f"{name}.png")
+        Image.fromarray(mask[:rows, :columns]).save(f"mask_{name}.png")
+    Path("shots.toml").write_text(SCREENSHOTS)
+    assert cli.run(["fit", "shots.toml", "-o", "out", "--json"]) == 0
+    found, lines = capfd.readouterr()
+    assert lines.count("\n") == 1
+    assert lines.startswith(
+        'jvr: warning: pictures of whole numbers that do not say their encoding are taken as sRGB: say encoding = "srgb"'
+    )
+    report, errors = json.loads(found), []
+    for i, name in enumerate("ab"):
+        target, fitted, difference = (jvr.read_image(f"out/{kind}_0{i}.exr") for kind in ("target", "fitted", "difference"))
+        unknown = np.isnan(target[..., 0])
+        np.testing.assert_array_equal(unknown, mask[: len(unknown), : len(unknown[0])] == 0)
+        true = jvr.linear_from_srgb(np.asarray(Image.open(f"{name}.png")) / 255)
+        errors.append((fitted - true)[~unknown])
+        np.testing.assert_allclose(difference[~unknown], errors[-1], atol=1e-6)
+        assert report["views"]["psnr"][i] == pytest.approx(-10 * np.log10(np.mean(np.square(errors[-1]))), abs=1e-3)
+        assert np.all(jvr.read_image(f"out/target_0{i}.png")[unknown] == 0)
+    everything = np.concatenate(errors)
+    assert report["views"]["mean_psnr"] == pytest.approx(-10 * np.log10(np.mean(np.square(everything))), abs=1e-3)
+    assert report["history"][-1]["psnr"] == pytest.approx(report["views"]["mean_psnr"], abs=1e-2)
+    Image.fromarray(255 - mask[:4]).save("mask_a.png")
+    for change, named in (("fit.encoding=linear", "images, weights"), ("fit.encoding=srgb", "images, weights")):
+        refused(f"fit shots.toml -o out --resume --set {change}", f"is of another fit ({named} changed since)", capfd)
+    refused("fit shots.toml -o mask_a.png", "mask_a.png: this is a file", capfd)
+
+
 @pytest.mark.slow
 def test_force_replaces_all_results_of_the_other_fit(tmp_path, capfd):
     (tmp_path / "out").mkdir()

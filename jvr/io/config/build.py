@@ -16,9 +16,10 @@ from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.light import graded, light_parts
 from jvr.io.config.load import Config, started
 from jvr.io.config.parts import made
-from jvr.io.config.schema.transfer import TransferFile, TransferTable
+from jvr.io.config.schema.transfer import TransferTable
 from jvr.io.config.schema.whole import FitTable, VolumeTable
-from jvr.io.config.transfers import build_transfer, read_transfer, with_gradient
+from jvr.io.config.targets import held_out_indices, views_in_files
+from jvr.io.config.transfers import build_transfer
 from jvr.model.camera import AbstractCamera, PerspectiveCamera, fibonacci_sphere
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTransfer, LutTransfer
@@ -33,10 +34,10 @@ READ_KEYWORDS += ("array", "series", "axes", "channel", "time", "missing", "nan_
 class FitJob(NamedTuple):
     """A fit as a configuration describes it.
 
-    - `scene`: where it starts; `cameras`, `targets`: of the views that take part.
+    - `scene`: where it starts; `cameras`, `targets`: of the views that take part; pixels that do not count are NaN.
     - `truth`: the transfer function that rendered the targets, `None` where they are files.
     - `held_out`: cameras and images that take no part, `None` without any.
-    - `keywords`: of `jvr.fit`: unknowns, solver, loss, priors and so on.
+    - `keywords`: of `jvr.fit`: unknowns, solver, loss, priors, weights and so on.
     - `keeps_radiance_transfer`: whether the radiance transfer stays that of the start though the unknowns change it.
     """
 
@@ -124,9 +125,10 @@ def build_fit(
     keywords = {**_keywords(config, fit), "unknowns": _unknowns(config, fit, scene), "settings": settings}
     scene = fit_scene(config, scene, precompute)
     if tables.truth is None:
-        images = _images(config, fit, cameras, read_image)
-        (inside, targets), held_out = _held_out_images(config, fit, cameras, images)
-        return FitJob(scene, inside, targets, None, held_out, keywords, keeps_radiance_transfer(config))
+        inside, outside = views_in_files(config, fit, cameras, read_image)
+        keywords["weights"] = inside.weights
+        held_out = (outside.cameras, outside.images) if outside.cameras else None
+        return FitJob(scene, inside.cameras, inside.images, None, held_out, keywords, keeps_radiance_transfer(config))
     truth = _transfer(config, tables.truth, volume, "truth")
     true_scene = precompute(_scene(config, volume, truth))
     picture = lambda camera: np.asarray(render(true_scene, camera, settings).rgb)
@@ -164,9 +166,9 @@ def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
 
 
 def _transfer(config: Config, table: TransferTable, volume: Volume, key: str) -> AbstractTransfer:
-    if isinstance(table, TransferFile):
-        return with_gradient(read_transfer(config.find(table.path, f"{key}.path")), table, config.where(key), key)
-    return build_transfer(table, volume, config.where(key), key)
+    path = getattr(table, "path", None)
+    file = None if path is None else config.find(path, f"{key}.path")
+    return build_transfer(table, volume, config.where(key), key, file)
 
 
 def _start_transfer(config: Config, fit: FitTable, volume: Volume) -> AbstractTransfer:
@@ -255,8 +257,12 @@ def _unknowns(config: Config, fit: FitTable, scene: Scene) -> Callable[[Scene], 
             continue
         near = difflib.get_close_matches(name, fittable, 1, 0.6)
         hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(fittable)}"
-        problem = "holds whole numbers, which cannot be fitted" if name in arrays else "is not an array of the scene"
-        key = f"fit.unknowns[{i}]"
+        problem, key = "is not an array of the scene", f"fit.unknowns[{i}]"
+        if name in arrays:
+            problem, hint = (
+                "holds integers, which have no derivative",
+                "volume.scale = [low, high] makes voxels floating-point numbers",
+            )
         raise ConfigError(config.where(key), key, f"'{name}' {problem}; {hint}")
 
     def select(scene: Scene) -> Any:
@@ -267,50 +273,12 @@ def _unknowns(config: Config, fit: FitTable, scene: Scene) -> Callable[[Scene], 
     return select
 
 
-def _images(config: Config, fit: FitTable, cameras: tuple[AbstractCamera, ...], read_image: Any) -> list[np.ndarray]:
-    if read_image is None:
-        from jvr.io.images import read_image
-    # Where nothing is behind the volume, light over black is what a picture holds; where that is to be found, nobody knows yet.
-    behind = None if "background" in fit.unknowns else config.tables.background or (0.0, 0.0, 0.0)
-    images = []
-    for i, name in enumerate(fit.images or ()):
-        key = f"fit.images[{i}]"
-        with blame(config.where(key), key):
-            images.append(np.asarray(read_image(config.find(name, key), background=behind)))
-    if len(images) != len(cameras):
-        where = config.where("fit.images")
-        raise ConfigError(where, "fit.images", f"{len(images)} images for {len(cameras)} cameras: give one for each camera")
-    for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
-        if image.shape[:2] != (camera.height, camera.width):
-            key, size = f"fit.images[{i}]", f"{image.shape[1]} x {image.shape[0]}"
-            problem = f"is {size} pixels, its camera sees {camera.width} x {camera.height}: resize one of them"
-            raise ConfigError(config.where(key), key, problem)
-    return images
-
-
-def _held_out_images(config: Config, fit: FitTable, cameras: tuple[AbstractCamera, ...], images: list[np.ndarray]) -> Any:
-    chosen = _indices(config, fit.held_out, len(cameras))
-    pick = lambda inside: [(c, t) for i, (c, t) in enumerate(zip(cameras, images, strict=True)) if (i in chosen) != inside]
-    split = lambda pairs: (tuple(c for c, _ in pairs), tuple(t for _, t in pairs))
-    return split(pick(True)), split(pick(False)) if chosen else None
-
-
-def _indices(config: Config, held_out: Any, count: int) -> set[int]:
-    chosen = set(held_out) if isinstance(held_out, list) else set()
-    if any(i >= count for i in chosen) or len(chosen) >= count:
-        where = config.where("fit.held_out")
-        raise ConfigError(
-            where, "fit.held_out", f"{sorted(chosen)} must be indices from 0 to {count - 1} and leave one view over"
-        )
-    return chosen
-
-
 def _extra_cameras(
     config: Config, fit: FitTable, cameras: tuple[AbstractCamera, ...], volume: Volume
 ) -> list[tuple[AbstractCamera, bool]]:
     """The cameras, each with whether it is held out; a number asks for views between the given ones."""
     if isinstance(fit.held_out, list):
-        chosen = _indices(config, fit.held_out, len(cameras))
+        chosen = held_out_indices(config, fit.held_out, len(cameras))
         return [(camera, i in chosen) for i, camera in enumerate(cameras)]
     given = [(camera, False) for camera in cameras]
     if not fit.held_out:

@@ -15,7 +15,6 @@ SENTENCES = {
     "model_type": "must be a table of keys",
     "model_attributes_type": "must be a table of keys",
     "bool_type": "must be true or false",
-    "too_short": "has too few entries",
 }
 
 
@@ -61,6 +60,9 @@ def first_complaint(error: ValidationError, data: Any) -> tuple[str, str]:
         return f"{key}.kind", "missing; it says what this table describes"
     if first["type"] == "union_tag_invalid":
         return f"{key}.kind", unknown_choice(context["tag"], _words(context["expected_tags"]))
+    if first["type"] == "too_short":
+        least = context["min_length"]
+        return key, f"must have at least {least} {'entry' if least == 1 else 'entries'}, not {shown(first['input'])}"
     if first["type"] in SENTENCES:
         return key, f"{SENTENCES[first['type']]}, not {shown(first['input'])}"
     return key, first["msg"].removeprefix("Value error, ")

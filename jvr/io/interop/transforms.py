@@ -68,7 +68,8 @@ def _frame(picture: Path, pose: np.ndarray, said: dict[str, Any]) -> tuple[Path,
 def _size(said: dict[str, Any], picture: Path) -> tuple[int, int]:
     if "w" in said and "h" in said:
         return int(said["w"]), int(said["h"])
-    height, width = read_image(picture).shape[:2]
+    # Its size is the same whatever its numbers mean.
+    height, width = read_image(picture, encoding="linear", alpha="ignored").shape[:2]
     return width, height
 
 

@@ -84,6 +84,7 @@ def difference_factor(differences: Sequence[np.ndarray]) -> int:
 
 
 def decibels(target: Any, found: Any) -> str:
-    """PSNR of one image relative to radiance 1, in words."""
-    error = float(np.mean(np.square(np.asarray(found, np.float64) - np.asarray(target, np.float64))))
+    """PSNR of one image relative to radiance 1, in words. Where the target is not finite it is not known."""
+    known = np.isfinite(target)
+    error = float(np.mean(np.square(np.asarray(found, np.float64)[known] - np.asarray(target, np.float64)[known])))
     return "identical" if error == 0 else f"{-10 * np.log10(error):.1f} dB" if np.isfinite(error) else "not finite"

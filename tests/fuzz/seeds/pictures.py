@@ -1,5 +1,6 @@
 """Pictures and environment maps: every layout and compression that OpenEXR writes, Radiance, PNG, JPEG."""
 
+import functools
 import struct
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from seeds.seed import SHAPE, Seed
 
 ROWS = 8 * -(-SHAPE[0] // 8) * -(-SHAPE[2] // 16)
 PIXELS = np.random.default_rng(0).random((ROWS, 2 * ROWS, 3)).astype(np.float32)
+# Of files that are read by it.
+LAYERS = {"exr, parts": "second", "exr, layers": "key"}
 REFUSED = ("exr, deep", "exr, subsampled")
 
 
@@ -25,10 +28,12 @@ def pictures(folder: Path) -> dict[str, Seed]:
     Image.fromarray(codes).save(folder / "a.jpg")
     Image.fromarray(codes).save(folder / "b.jpg", progressive=True)
     Image.fromarray(codes).quantize(16).save(folder / "b.png", transparency=3)
-    (folder / "c.png").write_bytes(_sixteen_bits(folder))
-    contents = {name: (folder / name).read_bytes() for name in ("a.exr", "a.png", "b.png", "c.png", "a.jpg", "b.jpg")}
+    (folder / "c.png").write_bytes(_sixteen_bits(folder, PIXELS))
+    (folder / "d.png").write_bytes(_sixteen_bits(folder, PIXELS[..., :2]))
+    contents = {name: (folder / name).read_bytes() for name in ("a.exr", "a.png", "b.png", "c.png", "d.png", "a.jpg", "b.jpg")}
     contents |= {"a.hdr": _radiance()} | _openexr(folder)
     names = {"a.exr": "exr", "a.png": "png", "b.png": "png, palette", "c.png": "png, 16 bits"}
+    names |= {"d.png": "png, 16 bits, grey with alpha"}
     names |= {"a.jpg": "jpg", "b.jpg": "jpg, progressive", "a.hdr": "hdr"}
     seeds = {names.get(name, name): _picture(name, content) for name, content in contents.items()}
     for ending in ("exr", "hdr"):
@@ -39,7 +44,8 @@ def pictures(folder: Path) -> dict[str, Seed]:
 
 def _picture(name: str, content: bytes) -> Seed:
     file = "a" + name[name.rindex(".") :] if "." in name else "a.exr"
-    return Seed({file: content}, file, read_image, (ImageError,), refused=name in REFUSED)
+    read = functools.partial(read_image, layer=LAYERS.get(name))
+    return Seed({file: content}, file, read, (ImageError,), refused=name in REFUSED)
 
 
 def _radiance() -> bytes:
@@ -48,13 +54,13 @@ def _radiance() -> bytes:
     return start + ROWS * (b"\x02\x02" + (2 * ROWS).to_bytes(2, "big") + 4 * channel)
 
 
-def _sixteen_bits(folder: Path) -> bytes:
-    """A colour PNG of 16 bits, which Pillow cannot write."""
+def _sixteen_bits(folder: Path, pixels: np.ndarray) -> bytes:
+    """A PNG of 16 bits with several channels, which Pillow cannot write."""
     import OpenImageIO
 
     file = OpenImageIO.ImageOutput.create(str(folder / "c.png"))
-    file.open(str(folder / "c.png"), OpenImageIO.ImageSpec(2 * ROWS, ROWS, 3, OpenImageIO.UINT16))
-    file.write_image((65535 * PIXELS).astype(np.uint16))
+    file.open(str(folder / "c.png"), OpenImageIO.ImageSpec(2 * ROWS, ROWS, pixels.shape[2], OpenImageIO.UINT16))
+    file.write_image((65535 * pixels).astype(np.uint16))
     file.close()
     return (folder / "c.png").read_bytes()
 
@@ -85,6 +91,7 @@ def _openexr(folder: Path) -> dict[str, bytes]:
     contents["exr, tiles"] = written(tiles(OpenEXR.ONE_LEVEL, OpenEXR.ZIP_COMPRESSION), planes)
     contents["exr, PIZ tiles"] = written(tiles(OpenEXR.ONE_LEVEL, OpenEXR.PIZ_COMPRESSION), halves)
     contents["exr, parts"] = written([OpenEXR.Part({"name": name} | lines, dict(planes)) for name in ("first", "second")])
+    contents["exr, layers"] = written(lines, planes | {f"key.{name}": plane for name, plane in halves.items()})
     deep = np.empty((8, 16), object)
     for at in np.ndindex(deep.shape):
         deep[at] = np.arange(1 + at[1] % 3, dtype=np.float32)

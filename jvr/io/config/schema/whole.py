@@ -154,14 +154,21 @@ def _held_out(value: Any) -> Any:
     return value
 
 
+# Keys that say how target images are read.
+OF_IMAGES = ("encoding", "alpha", "layer", "weights")
 LEAST_SQUARES = ("levenberg-marquardt", "gauss-newton", "dogleg")
 
 
 class FitTable(Table):
-    """What `jvr.fit` finds, and how. Target images are files, or are rendered with the transfer function of `[truth]`."""
+    """What `jvr.fit` finds, and how. Target images are files, read by `encoding`, `alpha` and `layer` (`jvr.read_image`) and weighted by
+    those of `weights`, or are rendered with the transfer function of `[truth]`."""
 
     unknowns: Annotated[list[str], Field(min_length=1)] = Field(default=["transfer.rgb", "transfer.sigma_t"])
     images: Annotated[list[str], Field(min_length=1)] | None = None
+    encoding: Literal["srgb", "linear"] | None = None
+    alpha: Literal["straight", "associated", "ignored"] | None = None
+    layer: str | None = None
+    weights: Annotated[list[str], Field(min_length=1)] | None = None
     start: StartTable | None = None
     initial: dict[str, Any] = Field(default={})
     solver: Literal["levenberg-marquardt", "gauss-newton", "dogleg", "lbfgsb", "bfgs", "lbfgs", "adam"] = "levenberg-marquardt"
@@ -180,6 +187,9 @@ class FitTable(Table):
     def _check(self) -> "FitTable":
         if self.loss == "dssim" and self.solver in LEAST_SQUARES:
             raise problem(f"'dssim' is not a sum over pixels, which solver = '{self.solver}' needs: use 'bfgs' or 'adam'", "loss")
+        for key in OF_IMAGES if self.images is None else ():
+            if getattr(self, key) is not None:
+                raise problem("is about target images in files: name them in fit.images, or leave it out", key)
         return self
 
 
