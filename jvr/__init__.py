@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from jvr.fitting.losses import Sparsity as Sparsity
     from jvr.fitting.losses import SquaredError as SquaredError
     from jvr.fitting.minimisers import LBFGSB as LBFGSB
+    from jvr.fitting.next_view import Candidate as Candidate
+    from jvr.fitting.next_view import next_view as next_view
     from jvr.fitting.residuals import residuals as residuals
     from jvr.integrators.refinement import Refinement as Refinement
     from jvr.integrators.slices.oracle import BrickRange as BrickRange

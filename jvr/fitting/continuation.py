@@ -9,7 +9,6 @@ import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -17,16 +16,13 @@ from jvr.fitting.least_squares import Model
 from jvr.fitting.problem import Problem
 from jvr.model.ranges import Interval
 
-# A value is not determined where its standard error exceeds this fraction of what it may plausibly be: the width of its range, or of an
-# extinction its value, at least a tenth over one voxel.
+# A value is not determined where its standard error exceeds this fraction of how large it may plausibly be.
 UNDETERMINED = 0.25
-LEAST_DEPTH = 0.1
 # What the continuation may add to the objective: 0.01 dB of its error.
 MOST_INCREASE = 10**0.001 - 1
 # The model of the objective is quadratic; where the objective itself grows by more, less is tried, so many times.
 TRIALS = 4
 BISECTIONS = 20
-TINY = 1e-30
 
 Values = Float[np.ndarray, "unknowns"]
 
@@ -75,7 +71,7 @@ def continued(
 
 def _roughness(problem: Problem, values: Values, errors: Values) -> _Roughness:
     unknowns, model, begin = problem.unknowns, problem.model, 0
-    least = LEAST_DEPTH / float(jnp.min(model.scene.volume.spacing))
+    plausible = unknowns.plausible(model, values)
     free, lower, upper = np.zeros(values.size, bool), np.full(values.size, -np.inf), np.full(values.size, np.inf)
     rows = []
     for i, array in enumerate(unknowns.values(model)):
@@ -86,25 +82,16 @@ def _roughness(problem: Problem, values: Values, errors: Values) -> _Roughness:
             continue
         lower[place], upper[place] = declared.low, declared.high
         for column in place.reshape(len(place), -1).T:
-            plausible = _plausible(values[column], declared, least)
-            loose = errors[column] > UNDETERMINED * plausible
+            loose = errors[column] > UNDETERMINED * plausible[column]
             if loose.all() or not loose.any():
                 continue
             free[column] = loose
-            scale = max(float(np.max(plausible[~loose])), TINY)
+            scale = float(np.max(plausible[column][~loose]))
             for one, other in itertools.pairwise(column):
                 row = np.zeros(values.size)
                 row[[one, other]] = -1 / scale, 1 / scale
                 rows.append(row)
     return _Roughness(np.reshape(rows, (-1, values.size)), free, lower, upper)
-
-
-def _plausible(values: Values, declared: Interval, least: float) -> Values:
-    """What values may be at most, as far as they and their declaration say."""
-    width = declared.high - declared.low
-    return (
-        np.full(values.shape, width) if np.isfinite(width) else np.maximum(np.abs(values), least if declared.per_length else TINY)
-    )
 
 
 def _smoothest(rough: _Roughness, values: Values, around: Quadratic, budget: float) -> Values:

@@ -86,6 +86,8 @@ class FitResult(NamedTuple):
     - `standard_errors`: of every fitted value, in the structure of `unknowns(scene)`; infinite where the images do not determine it,
       NaN for more unknowns than a Gauss-Newton matrix is made for (voxels).
     - `unknowns`: the paths of the fitted arrays in the scene, such as `transfer.rgb`, in the order of `standard_errors`.
+    - `information`: the inverse of the covariance of all fitted values, one after the other, as plain noise would have it, `(n, n)`; empty
+      where there are too many. `jvr.next_view` reads it.
     - `outcome`: how the iteration ended.
     - `exposure`: the fitted factor between rendered and target radiance, 1 where it was not asked for.
     - `stats`: `FitStats`.
@@ -95,6 +97,7 @@ class FitResult(NamedTuple):
     history: tuple[Iteration, ...]
     standard_errors: Any
     unknowns: tuple[str, ...]
+    information: np.ndarray
     outcome: Outcome
     exposure: float
     stats: FitStats
@@ -239,6 +242,7 @@ def fit(
         history=tuple(history),
         standard_errors=jax.tree.unflatten(structure, errors[: len(selected)]),
         unknowns=chosen.names[: len(selected)],
+        information=known.information,
         outcome=outcome or Outcome.STEP_LIMIT,
         exposure=1.0 if found.exposure is None else float(found.exposure),
         stats=stats,

@@ -64,6 +64,7 @@ class Identifiability(NamedTuple):
 
     - `standard_errors`: of each unknown, in its own unit; infinite where the images do not determine it.
     - `variance`: of the residuals, `sum w r^2 / (m - rank)`.
+    - `information`: the Gauss-Newton matrix over that variance, the inverse of the covariance of plain noise.
     - `rank`: number of combinations of unknowns that the images determine.
     - `least_determined`: the least-determined direction among the unknowns that are seen at all, one coefficient for each (in units of
       its own sensitivity), unit length.
@@ -73,6 +74,7 @@ class Identifiability(NamedTuple):
 
     standard_errors: Float[np.ndarray, "unknowns"]
     variance: float
+    information: Float[np.ndarray, "unknowns unknowns"]
     rank: int
     least_determined: Float[np.ndarray, "unknowns"]
     condition: float
@@ -83,7 +85,7 @@ class Identifiability(NamedTuple):
 def undetermined(unknowns: int) -> Identifiability:
     """What stands for the identifiability of unknowns that are too many for their Gauss-Newton matrix: nothing but NaN."""
     nothing = np.full(unknowns, np.nan)
-    return Identifiability(nothing, float("nan"), 0, nothing, float("nan"), float("nan"), False)
+    return Identifiability(nothing, float("nan"), np.zeros((0, 0)), 0, nothing, float("nan"), float("nan"), False)
 
 
 def identifiability(
@@ -126,7 +128,7 @@ def identifiability(
     weakest[seen] = vectors[:, 0] if seen.size else 0.0
     condition = float(eigenvalues[-1] / eigenvalues[counts][0]) if rank else np.inf
     effect = float("nan") if scores is None else scores.design_effect
-    return Identifiability(errors, variance, rank, weakest, condition, effect, structured)
+    return Identifiability(errors, variance, matrix / max(variance, TINY), rank, weakest, condition, effect, structured)
 
 
 def _noise(eigenvalues: Float[np.ndarray, "n"], epsilon: float) -> float:

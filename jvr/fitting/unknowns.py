@@ -15,6 +15,9 @@ from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range
 from jvr.model.scene import Scene
 from jvr.types import Scalar
 
+# An extinction may plausibly be so much over one voxel at least.
+LEAST_DEPTH = 0.1
+
 
 class ExposedModel(eqx.Module):
     """A scene and the factor between its radiance and the target images' (`None` where they are in the same unit)."""
@@ -76,6 +79,19 @@ class Unknowns(eqx.Module):
         limits = [(*t.bounds(part), t.trust_radius(part)) for t, part in zip(self.bijectors, parts, strict=True)]
         lower, upper, trust_radius = (np.concatenate([np.ravel(a) for a in arrays]) for arrays in zip(*limits, strict=True))
         return lower, upper, trust_radius
+
+    def plausible(self, model: ExposedModel, values: Float[np.ndarray, "unknowns"]) -> Float[np.ndarray, "unknowns"]:
+        """How large each value may be, as far as it and its declaration say: the width of its range, else its own size, of an extinction at
+        least a tenth over one voxel, of anything without a unit that we know at least 1."""
+        sizes, voxel = np.abs(values), float(jnp.min(model.scene.volume.spacing))
+        ends = np.cumsum([value.size for value in self.values(model)])
+        for part, declared in zip(np.split(sizes, ends[:-1]), self.ranges, strict=True):
+            known = isinstance(declared, Interval)
+            if known and np.isfinite(declared.high - declared.low):
+                part[:] = declared.high - declared.low
+            else:
+                np.maximum(part, LEAST_DEPTH / voxel if known and declared.per_length else 1.0, out=part)
+        return sizes
 
     def model_from_unconstrained(self, model: ExposedModel, unconstrained: Float[Array, "unknowns"]) -> ExposedModel:
         """The model whose unknowns are those of `unconstrained`."""

@@ -1,0 +1,90 @@
+"""Which view to take next: what each candidate would add to what a fit knows."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jvr.fitting.fit import FitResult
+from jvr.fitting.losses import SquaredError
+from jvr.fitting.normal_equations import light_tangents, normal_equations
+from jvr.fitting.observations import is_mostly_empty, observe
+from jvr.fitting.problem import Problem
+from jvr.fitting.unknowns import ExposedModel, choose_unknowns, leaves_by_name
+from jvr.model.camera import AbstractCamera
+from jvr.rendering.settings import Settings
+
+
+class Candidate(NamedTuple):
+    """What one more view would bring.
+
+    - `index`: of the camera among the candidates; `camera`.
+    - `gain`: information about the unknowns together, in bits: `log2(det(F + F_view) / det(F)) / 2` (D-optimality).
+    - `errors`: standard errors of the unknowns afterwards by name, as plain noise would have them.
+    """
+
+    index: int
+    camera: AbstractCamera
+    gain: float
+    errors: dict[str, np.ndarray]
+
+
+def next_view(result: FitResult, candidates: Sequence[AbstractCamera], settings: Settings = Settings()) -> tuple[Candidate, ...]:
+    """Ranks views that could be taken by what they would add to a fit, the best first.
+
+    With the information `F` of a fit, `sum J^T J / s^2` over its pixels with the residual variance `s^2`, a view adds the same sum over its
+    own pixels: their rows `J` at the fitted values need no picture. Views are compared by the determinant (D-optimality: Chaloner and
+    Verdinelli 1995), which no choice of units changes. What the fit leaves open counts as uncertain by as much as it may plausibly be: the
+    width of a range, else a value's own size (`jvr.fitting.unknowns.Unknowns.plausible`). Gains of several views do not add up: take the
+    first, fit again, ask again.
+
+    **Arguments:** `result`: of `jvr.fit`, of a table or other few unknowns; `candidates`: cameras of any kind and size; `settings`:
+    those of the fit.
+    **Raises** `ValueError` for a fit that has no information matrix (voxels, DSSIM's included), and without candidates.
+    """
+    if not result.information.size:
+        raise ValueError(
+            "the fit has too many unknowns for an information matrix: next_view ranks views for tables and other few unknowns"
+        )
+    if not candidates:
+        raise ValueError("there are no candidates: give cameras that could be taken, such as jvr.orbit(...)")
+    problem, values = _problem(result, settings)
+    size = problem.unknowns.plausible(problem.model, np.asarray(values, np.float64))
+    # In units of what is plausible, so that the small matrix is well scaled.
+    before = size[:, None] * result.information * size + np.eye(size.size)
+    found = []
+    for i, camera in enumerate(candidates):
+        after = before + size[:, None] * _information(problem, values, camera) * size / result.stats.residual_variance
+        gain = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]) / np.log(2)
+        errors = size * np.sqrt(np.diag(np.linalg.inv(after)))
+        parts = np.split(errors, np.cumsum([v.size for v in problem.unknowns.values(problem.model)])[:-1])
+        shaped = {
+            n: p.reshape(np.shape(v))
+            for n, p, v in zip(problem.unknowns.names, parts, problem.unknowns.values(problem.model), strict=True)
+        }
+        found.append(Candidate(i, camera, float(gain), {name: shaped[name] for name in result.unknowns}))
+    return tuple(sorted(found, key=lambda candidate: -candidate.gain))
+
+
+def _problem(result: FitResult, settings: Settings) -> tuple[Problem, jax.Array]:
+    """The fit again, at its end, and its values."""
+    select = lambda m: tuple(leaves_by_name(m.scene)[name] for name in result.unknowns)
+    model = ExposedModel(result.scene, None)
+    fitted = sum(np.size(leaf) for leaf in select(model))
+    if len(result.information) > fitted:
+        model, without = ExposedModel(result.scene, jnp.asarray(result.exposure, jnp.result_type(float))), select
+        select = lambda m: (*without(m), m.exposure)
+    chosen = choose_unknowns(model, select)
+    problem = Problem(model, chosen, settings, SquaredError(), (), None, is_mostly_empty(result.scene, settings))
+    return problem, jnp.concatenate([jnp.ravel(value) for value in chosen.values(model)])
+
+
+def _information(problem: Problem, values: jax.Array, camera: AbstractCamera) -> Float[np.ndarray, "unknowns unknowns"]:
+    """`sum J^T J` over the pixels of a view."""
+    nothing: list[Any] = [np.zeros((camera.height, camera.width, 3), values.dtype)]
+    rays, around = observe(problem.model.scene, [camera], nothing, None, problem.settings), light_tangents(problem, values)
+    tiles = (normal_equations(problem, values, rays, i, 1, around) for i in range(rays.tile_count()))
+    return np.sum([np.asarray(tile.matrix, np.float64) for tile in tiles], axis=0)
