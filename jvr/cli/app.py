@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from jvr.cli.beforehand import lines_of
+from jvr.cli.flags import given_of, triple
 from jvr.cli.inputs import (
     BadInput,
     check_file_output,
@@ -89,7 +90,8 @@ def render(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="ct, ct_bone, ct_soft_tissue, ct_lung, ct_vessels (angiography), mr, micro_ct, scan, labels; default: by the values."
+            help="ct, ct_bone, ct_soft_tissue, ct_lung, ct_vessels (angiography), mr, micro_ct, scan, labels, or one of 3D Slicer's, "
+            "such as CT-Bone; default: by the values."
         ),
     ] = None,
     view: Annotated[
@@ -134,8 +136,8 @@ def render(
         check_image_output(output)
         choice = {"array": array, "series": series, "axes": axes, "channel": channel, "time": time}
         scaled = {"slope": slope, "intercept": intercept, "missing": missing, "nan_value": nan_value}
-        keywords = _given(shape, spacing, origin, direction, dtype=dtype, **choice, **scaled)
-        wishes = Wishes(preset, view, _triple(up, "--up", float, positive=False), background, orbit, lit)
+        keywords = given_of(shape, spacing, origin, direction, dtype=dtype, **choice, **scaled)
+        wishes = Wishes(preset, view, triple(up, "--up", float, positive=False), background, orbit, lit)
         config, volume, notes = configured(given, sets or [], keywords, wishes)
         config = _sized(config, size)
     for note in notes:
@@ -275,7 +277,7 @@ def info(
 
         choice = {"array": array, "series": series, "axes": axes, "channel": channel, "time": time}
         scaled = {"slope": slope, "intercept": intercept, "missing": missing, "nan_value": nan_value}
-        keywords = _given(shape, spacing, origin, direction, dtype=dtype, **choice, **scaled)
+        keywords = given_of(shape, spacing, origin, direction, dtype=dtype, **choice, **scaled)
         found = describe(read_volume(volume, **keywords), volume)
     _print(found, as_json, format_description(found))
 
@@ -297,49 +299,45 @@ def demo(
     _print(report, as_json, _summary(report, output))
 
 
-def _given(shape: str | None, spacing: str | None, origin: str | None, direction: str | None, **others: Any) -> dict[str, Any]:
-    """Keywords of a volume from flags."""
-    triples: dict[str, Any] = {"shape": _triple(shape, "--shape", int), "spacing": _triple(spacing, "--spacing", float)}
-    triples |= {"origin": _triple(origin, "--origin", float, positive=False), "direction": _matrix(direction)}
-    if (missing := others.pop("missing")) is not None:
-        triples["missing"] = False if missing.lower() == "none" else _number(missing, "--missing")
-    return {name: value for name, value in (triples | others).items() if value is not None}
+@app.command(
+    epilog=_examples(
+        "jvr preset out/transfer.toml -o bone.vp.json",
+        "jvr preset CT-Bone -o bone.toml",
+        "jvr preset maps.json --name Jet --range 0,400 -o jet.toml",
+    )
+)
+def preset(
+    given: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE|NAME", help="A transfer function (.toml), .vp, .vp.json, ParaView's .json, or Slicer's name."
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="For jvr (.toml), 3D Slicer (.vp.json, .vp) or ParaView (.json).")
+    ],
+    name: Annotated[
+        str | None, typer.Option(help="Which of several presets of ParaView; of one that is written, its name.")
+    ] = None,
+    ends: Annotated[
+        str | None, typer.Option("--range", metavar="LOW,HIGH", help="Scalars that the ends of ParaView's preset are moved to.")
+    ] = None,
+    unit_distance: Annotated[
+        float | None, typer.Option(help="Millimetres that opacities belong to.", show_default="the file's, or 1")
+    ] = None,
+    spacing: Annotated[float, typer.Option(help="Mean distance of voxels, for opacity by gradient.")] = 1.0,
+    encoding: Annotated[
+        str, typer.Option(help="Whether colours of other programs are taken for linear light, or for srgb codes.")
+    ] = "linear",
+    as_json: Json = False,
+) -> None:
+    """Convert transfer functions from and to the presets of 3D Slicer and ParaView, and say what they cannot hold."""
+    from jvr.cli.preset import convert
 
-
-def _number(text: str, flag: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise BadInput(f"{flag} {text}: must be a number, or none") from None
-
-
-def _triple(text: str | None, flag: str, kind: type, *, positive: bool = True) -> list[Any] | None:
-    if text is None:
-        return None
-    try:
-        numbers = [kind(part) for part in text.replace("x", ",").split(",")]
-        # One distance stands for all three.
-        numbers = 3 * numbers if flag == "--spacing" and len(numbers) == 1 else numbers
-    except ValueError:
-        numbers = []
-    if len(numbers) != 3 or (positive and min(numbers) <= 0):
-        what = "whole numbers of voxels" if kind is int else "numbers of millimetres"
-        example = "-120,-120,40.5" if not positive else "256,256,128" if kind is int else "0.5,0.5,2"
-        raise BadInput(f"{flag} {text}: must be three {'positive ' if positive else ''}{what} along x, y, z, such as {example}")
-    return numbers
-
-
-def _matrix(text: str | None) -> list[list[float]] | None:
-    """Nine numbers, axis by axis, as a matrix with the axes in its columns."""
-    if text is None:
-        return None
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 9:
-        raise BadInput(f"--direction {text}: must be nine numbers, the directions of x, y and z, such as 1,0,0,0,1,0,0,0,1")
-    return [numbers[k::3] for k in range(3)]
+    with reading():
+        report = convert(given, output, name, ends, unit_distance, spacing, encoding)
+    shading = [f"[shading]  {report['shading']}"] if report["shading"] else []
+    _print(report, as_json, "\n".join([*shading, f"written to {output}"]))
 
 
 def _sized(config: Any, size: int | None) -> Any:

@@ -2,12 +2,16 @@
 
 import dataclasses
 import re
+import typing
 from pathlib import Path
 from typing import Any
 
 from jvr.cli.inputs import BadInput, load
 from jvr.cli.runtime import start_jax
 from jvr.io.config import Config, build_volume, config_from, interpolated
+from jvr.io.config.errors import did_you_mean
+from jvr.io.config.schema.transfer import PresetTable
+from jvr.io.interop.slicer import slicer_presets
 from jvr.model.volume import Volume
 
 
@@ -36,6 +40,8 @@ def configured(given: Path, sets: list[str], keywords: dict[str, Any], wishes: W
     from jvr.io.first_picture import first_picture
 
     start_jax()
+    if wishes.preset is not None and wishes.preset not in known_presets():
+        raise BadInput(f"--preset {wishes.preset}: unknown preset; {did_you_mean(wishes.preset, known_presets())}")
     of_volume = [text for text in sets if re.match(r"\s*volume\s*[.=]", text)]
     if whole := next((text for text in of_volume if re.match(r"\s*volume\s*=", text)), None):
         raise BadInput(f"--set {whole}: set the keys of the volume one by one, such as volume.spacing=[1,1,2]")
@@ -46,6 +52,11 @@ def configured(given: Path, sets: list[str], keywords: dict[str, Any], wishes: W
     tables["camera"] = _camera(wishes, tables["camera"])
     config = config_from(tables, str(given), given.parent, sets)
     return config, interpolated(config, volume), notes
+
+
+def known_presets() -> list[str]:
+    """What `--preset` may be: presets of jvr and of 3D Slicer."""
+    return [*typing.get_args(PresetTable.model_fields["preset"].annotation), *slicer_presets()]
 
 
 def _camera(wishes: Wishes, guessed: dict[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from jvr.cli.inputs import BadInput, check_inputs_stay, explain, inputs_of, read
 from jvr.cli.runtime import plain, progress, provenance, start_jax
 from jvr.io.animation import write_animation
 from jvr.io.config import Config, build_cameras, build_scene, build_settings
-from jvr.io.config.schema.transfer import PresetTable
+from jvr.io.config.schema.transfer import PresetTable, SlicerTable
 from jvr.io.first_picture import what_is_seen
 from jvr.io.volumes.errors import available_memory
 from jvr.model.volume import Volume
@@ -33,7 +33,7 @@ def render_pictures(config: Config, output: Path, volume: Volume | None = None, 
     with reading():
         scene, settings = build_scene(config, volume), build_settings(config)
         cameras = build_cameras(config, scene.volume, scene.transfer)
-        if isinstance(config.tables.transfer, PresetTable) and (note := what_is_seen(scene.volume, scene.transfer)):
+        if isinstance(config.tables.transfer, PresetTable | SlicerTable) and (note := what_is_seen(scene.volume, scene.transfer)):
             explain(f"note: {note}", 0)
         _check_memory(cameras)
         outputs, inputs = _names(output, len(cameras)), inputs_of(config)

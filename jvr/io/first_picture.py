@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jvr.io.config.transfers import LABEL_DEPTH, contents
+from jvr.io.interop.slicer import slicer_presets, slicer_property
 from jvr.io.volumes.dicom import looks_like_dicom
 from jvr.io.volumes.errors import first_bytes
 from jvr.io.volumes.slices import is_slices
@@ -45,7 +46,8 @@ class FirstPicture(NamedTuple):
 def first_picture(volume: Volume, path: Path, preset: str | None = None, *, lit: bool = True) -> FirstPicture:
     """What shows a volume of which nothing is known but what it holds.
 
-    **Arguments:** `preset`: by name, where somebody has chosen one; `lit`: with a light at the eye and surfaces where the scalar changes.
+    **Arguments:** `preset`: by name, of jvr or of 3D Slicer, where somebody has chosen one; `lit`: with a light at the eye and surfaces
+    where the scalar changes.
     """
     notes = []
     kind = preset
@@ -55,11 +57,22 @@ def first_picture(volume: Volume, path: Path, preset: str | None = None, *, lit:
     tables: dict[str, Any] = {"transfer": {"kind": "preset", "preset": kind}, "camera": {"frame": "visible", **_facing(volume)}}
     if kind == "labels":
         tables["volume"] = {"interpolation": "nearest"}
-    if lit:
+    if kind in slicer_presets():
+        tables |= _of_slicer(kind, lit)
+    elif lit:
         tables |= {"lights": LIGHTS, "shading": {**SHADING, "threshold": _surface(volume, kind)}}
     if not _says_what_is_up(path):
         notes.append("the file does not say what is up: z is taken for it (--up and --view say otherwise)")
     return FirstPicture(tables, notes)
+
+
+def _of_slicer(name: str, lit: bool) -> dict[str, Any]:
+    """Tables of a preset of 3D Slicer. Its colours are those of a screen."""
+    said, tables = slicer_property(name), {"transfer": {"kind": "slicer", "name": name, "encoding": "srgb"}}
+    if not (lit and said.shade):
+        return tables
+    shading = {"kind": "phong", "ambient": said.ambient, "diffuse": said.diffuse, "specular": said.specular}
+    return tables | {"lights": LIGHTS, "normals": "central", "shading": {**shading, "shininess": max(said.power, 1.0)}}
 
 
 def _says_what_is_up(path: Path) -> bool:

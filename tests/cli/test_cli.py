@@ -14,6 +14,7 @@ import pytest
 
 import jvr
 from jvr import cli
+from jvr.io import interop
 from jvr.io.config import read_transfer
 from jvr.io.images import read_image
 
@@ -105,6 +106,15 @@ def snapshot(folder):
         ("render fit.toml -o kept.png --set volume.path=x.mhd", "$JVR_DATA"),
         ("render fit.toml -o kept.png --preset ct_bone", "--preset"),
         ("render volume.npy -o kept.png --preset ct_bones", "did you mean 'ct_bone'?"),
+        ("render volume.npy -o kept.png --preset CT-Bon", "did you mean 'CT-Bone'?"),
+        ("preset CT-Bon -o a.toml", "did you mean 'CT-Bone'?"),
+        ("preset CT-Bone -o a.xml", "written as .toml, .vp.json, .vp or .json"),
+        ("preset none.vp -o a.toml", "none.vp"),
+        ("preset kept.png -o a.toml", "neither a preset of 3D Slicer nor .toml"),
+        ("preset CT-Bone -o a.toml --range 0,1", "--range"),
+        ("preset CT-Bone -o a.toml --unit-distance 0", "--unit-distance 0"),
+        ("preset CT-Bone -o a.toml --encoding gamma", "--encoding gamma"),
+        ("preset fit.toml -o fit.toml", "would change fit.toml, which is read"),
         ("render volume.npy -o kept.png --shape 6,7", "--shape"),
         ("render kept.png -o kept.png", "one picture is no volume"),
         ("render fit.toml -o kept.png --set shadows=['rays','map']", "'rays' and 'map' exclude each other"),
@@ -154,7 +164,7 @@ def test_a_write_protected_output_is_refused_before_work(tmp_path, capsys, monke
 def test_help_shows_examples(capsys):
     assert cli.run([]) == 0
     assert "render" in capsys.readouterr().out
-    for command in ("render", "fit", "plan", "info", "demo"):
+    for command in ("render", "fit", "plan", "info", "demo", "preset"):
         assert cli.run([command, "--help"]) == 0
         assert f"jvr {command}" in capsys.readouterr().out.split("Examples")[1]
 
@@ -179,10 +189,29 @@ def test_several_cameras_give_numbered_pictures(tmp_path):
     assert read_image("a_00.png").shape == (6, 6, 3)
 
 
-@pytest.mark.parametrize("flags", ["", "--preset ct_bone"])
+@pytest.mark.parametrize("flags", ["", "--preset ct_bone", "--preset CT-Muscle"])
 def test_a_volume_file_renders_directly(flags, tmp_path):
     assert cli.run(f"render volume.npy -o v.png --size 8 {flags}".split()) == 0
     assert read_image("v.png").max() > 0.05
+
+
+def test_presets_are_converted(capfd):
+    assert cli.run(["preset", "CT-Bone", "-o", "a.toml"]) == 0
+    printed = capfd.readouterr()
+    assert '[shading]  kind = "phong", ambient = 0.1, diffuse = 0.9, specular = 0.2, shininess = 10' in printed.out
+    assert printed.err == ""
+    assert cli.run(["preset", "a.toml", "-o", "a.json", "--name", "bone"]) == 0
+    assert cli.run(["preset", "a.json", "-o", "b.vp.json", "--name", "bone", "--range", "0,100", "--unit-distance", "2"]) == 0
+    capfd.readouterr()
+    assert cli.run(["preset", "CT-Soft-Tissue", "-o", "c.vp", "--json"]) == 0
+    printed = capfd.readouterr()
+    assert list(json.loads(printed.out)["lost"]) == ["opacity of 1"]
+    assert printed.err.startswith("jvr: warning: CT-Soft-Tissue: not kept: opacity of 1")
+    one, other = read_transfer("a.toml"), interop.slicer_preset("CT-Bone").transfer
+    np.testing.assert_array_equal(one.sigma_t, other.sigma_t)
+    moved = interop.read_slicer("b.vp.json")
+    assert moved.unit_distance == 2
+    np.testing.assert_allclose(moved.transfer.ends, (0, 100))
 
 
 def test_plan_and_info_as_text_and_json(tmp_path, capsys):

@@ -16,10 +16,10 @@ from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.light import graded, light_parts
 from jvr.io.config.load import Config, started
 from jvr.io.config.parts import made
-from jvr.io.config.schema.transfer import TransferFile, TransferTable
+from jvr.io.config.schema.transfer import TransferTable
 from jvr.io.config.schema.whole import FitTable, VolumeTable
 from jvr.io.config.targets import held_out_indices, views_in_files
-from jvr.io.config.transfers import build_transfer, read_transfer, with_gradient
+from jvr.io.config.transfers import build_transfer
 from jvr.model.camera import AbstractCamera, PerspectiveCamera, fibonacci_sphere
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTransfer, LutTransfer
@@ -166,9 +166,9 @@ def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
 
 
 def _transfer(config: Config, table: TransferTable, volume: Volume, key: str) -> AbstractTransfer:
-    if isinstance(table, TransferFile):
-        return with_gradient(read_transfer(config.find(table.path, f"{key}.path")), table, config.where(key), key)
-    return build_transfer(table, volume, config.where(key), key)
+    path = getattr(table, "path", None)
+    file = None if path is None else config.find(path, f"{key}.path")
+    return build_transfer(table, volume, config.where(key), key, file)
 
 
 def _start_transfer(config: Config, fit: FitTable, volume: Volume) -> AbstractTransfer:

@@ -1,6 +1,7 @@
 """Transfer functions in TOML: as a table of a configuration, and as a file of their own that a fit writes."""
 
 import os
+from pathlib import Path
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -9,13 +10,19 @@ from jvr.atomic import replacing
 from jvr.io.config.errors import ConfigError, blame, first_complaint
 from jvr.io.config.parts import made
 from jvr.io.config.schema.transfer import (
+    ImportedTable,
+    ParaViewTable,
     PresetTable,
+    SlicerTable,
     Transfer,
     TransferFile,
     TransferTable,
     WindowTable,
 )
 from jvr.io.config.text import array_text, read_toml
+from jvr.io.interop.paraview import read_paraview
+from jvr.io.interop.presets import Preset
+from jvr.io.interop.slicer import read_slicer, slicer_preset
 from jvr.io.kinds import KINDS
 from jvr.model import presets
 from jvr.model.gradient_transfer import GradientOpacity
@@ -63,12 +70,18 @@ def read_transfer(path: str | os.PathLike) -> AbstractTransfer:
     return build_transfer(table, None, name, "")
 
 
-def build_transfer(table: TransferTable, volume: Volume | None, where: str, key: str) -> AbstractTransfer:
-    """The transfer function of a table; presets and an automatic window look at the volume."""
-    if isinstance(table, TransferFile):
+def build_transfer(
+    table: TransferTable, volume: Volume | None, where: str, key: str, file: Path | None = None
+) -> AbstractTransfer:
+    """The transfer function of a table; presets and an automatic window look at the volume. `file`: what its path means."""
+    if file is None and getattr(table, "path", None) is not None:
         raise ConfigError(where, key, "a transfer file cannot name another file")
     with blame(where, key):
         match table:
+            case TransferFile() if file is not None:
+                found = read_transfer(file)
+            case ImportedTable():
+                found = imported(table, volume, file).transfer
             case PresetTable():
                 found = _preset(table, volume)
             case WindowTable():
@@ -84,6 +97,20 @@ def with_gradient(transfer: AbstractTransfer, table: TransferTable, where: str, 
         return transfer
     with blame(where, f"{key}.gradient_opacity".lstrip(".")):
         return GradientOpacity(transfer, **table.gradient_opacity.given())
+
+
+def imported(table: ImportedTable, volume: Volume | None, file: Path | None) -> Preset:
+    """The preset of another program that a table names."""
+    # The gradients of other programs are by the mean distance of voxels.
+    spacing = 1.0 if volume is None else float(np.mean(np.asarray(volume.spacing)))
+    if isinstance(table, ParaViewTable) and file is not None:
+        ends = None if table.range is None else (table.range[0], table.range[1])
+        return read_paraview(file, table.name, range=ends, unit_distance=table.unit_distance or 1.0, encoding=table.encoding)
+    assert isinstance(table, SlicerTable)
+    if file is not None:
+        return read_slicer(file, unit_distance=table.unit_distance, spacing=spacing, encoding=table.encoding)
+    assert table.name is not None
+    return slicer_preset(table.name, spacing=spacing, encoding=table.encoding)
 
 
 def _preset(table: PresetTable, volume: Volume | None) -> AbstractTransfer:

@@ -20,6 +20,7 @@ TRANSFERS = {
     "sampled": 'kind = "sampled"\nentries = 32\ndomain = [0, 1]\npositions = [0, 1]\nrgb = [[0, 0, 0], [1, 1, 1]]\n'
     'extinction = [\n{ kind = "ramp", between = [0.2, 0.4], height = 1 },\n'
     '{ kind = "gaussian", center = 0.5, width = 0.1, height = 2 },\n]\n',
+    "slicer": 'kind = "slicer"\nname = "MR-T2-Brain"\nencoding = "srgb"\n',
     "gradient": 'kind = "gradient"\ndomain = [0, 1]\nmagnitudes = [1, 2]\nrgb = [[[0, 0, 0], [1, 1, 1]], [[0, 0, 0], [1, 0, 0]]]\n'
     "sigma_t = [[0, 0], [1, 2]]\n",
 }
@@ -42,7 +43,7 @@ def tables(folder: Path) -> dict[str, Seed]:
     seeds["config, scene"] = _scene(files)
     for kind, text in TRANSFERS.items():
         seeds[f"transfer, {kind}"] = Seed({"a.toml": text.encode()}, "a.toml", read_transfer, (ConfigError,))
-    seeds |= _cameras()
+    seeds |= _cameras() | _presets(folder)
     seeds["merl"] = _merl()
     seeds["checkpoint"] = _checkpoint(folder)
     return seeds | _scenes(folder)
@@ -76,6 +77,25 @@ def _cameras() -> dict[str, Seed]:
     return {
         "camera, pvcc": Seed({"a.pvcc": paraview.encode()}, "a.pvcc", read, (interop.CameraError,)),
         "cameras, json": Seed({"a.json": transforms.encode()}, "a.json", interop.read_transforms, (interop.CameraError,)),
+    }
+
+
+def _presets(folder: Path) -> dict[str, Seed]:
+    """Presets of other programs."""
+    from jvr.io import interop
+
+    given = interop.slicer_preset("CT-Fat")
+    interop.write_slicer(folder / "a.vp", given)
+    interop.write_slicer(folder / "a.vp.json", given)
+    bent = {"RGBPoints": [0, 0.1, 0.2, 1, 5, 1, 0, 0, 9, 0, 1, 0], "Points": [0, 0, 0.5, 0, 5, 0.7, 0.3, 0.4, 9, 1, 0.5, 1]}
+    maps = [{"Name": space, "ColorSpace": space, **bent} for space in ("Diverging", "HSV")]
+    maps[0] |= {"UseLogScale": 0, "UseBelowRangeColor": 1, "BelowRangeColor": [1, 1, 1]}
+    contents = {name: (folder / name).read_bytes() for name in ("a.vp", "a.vp.json")}
+    read = lambda path: interop.read_paraview(path, "Diverging", range=(-1, 7))
+    return {
+        "preset, vp": Seed({"a.vp": contents["a.vp"]}, "a.vp", interop.read_slicer, (interop.PresetError,)),
+        "preset, vp.json": Seed({"a.vp.json": contents["a.vp.json"]}, "a.vp.json", interop.read_slicer, (interop.PresetError,)),
+        "preset, paraview": Seed({"a.json": json.dumps(maps).encode()}, "a.json", read, (interop.PresetError,)),
     }
 
 

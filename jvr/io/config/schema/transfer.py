@@ -3,11 +3,13 @@
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from jvr.io.config.checks import number, problem, whole
+from jvr.io.config.errors import unknown_choice
 from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, only, part
-from jvr.io.config.schema.table import Colour, Extinction, Positions, Range, Scalar, Table
+from jvr.io.config.schema.table import Colour, Extinction, Length, Positions, Range, Scalar, Table
+from jvr.io.interop.slicer import slicer_presets
 from jvr.model.gradient_transfer import GradientOpacity
 from jvr.model.ranges import POSITIVE, Interval
 from jvr.model.transfer import AbstractTransfer, LutTransfer
@@ -112,6 +114,41 @@ class WindowTable(TransferTable):
         return self
 
 
+def _slicer_name(value: Any) -> Any:
+    if isinstance(value, str) and value not in slicer_presets():
+        raise problem(unknown_choice(value, slicer_presets()))
+    return value
+
+
+class ImportedTable(TransferTable):
+    """A preset of another program: what its colours are, and the length that its opacities belong to."""
+
+    unit_distance: Length | None = None
+    encoding: Literal["linear", "srgb"] = "linear"
+
+
+class SlicerTable(ImportedTable):
+    """A preset of 3D Slicer: one of its own by name, or a file."""
+
+    name: Annotated[str, BeforeValidator(_slicer_name)] | None = None
+    path: str | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "SlicerTable":
+        self._one_of("name", "path")
+        if self.name is not None and self.unit_distance is not None:
+            raise problem("belongs to files; presets by name have a millimetre", "unit_distance")
+        return self
+
+
+class ParaViewTable(ImportedTable):
+    """A preset of ParaView in JSON, the one called `name`, its ends moved to `range`."""
+
+    path: str
+    name: str | None = None
+    range: Range | None = None
+
+
 class TransferFile(TransferTable):
     """A transfer function in a file of its own, as a fit writes it."""
 
@@ -119,5 +156,12 @@ class TransferFile(TransferTable):
 
 
 BASES[AbstractTransfer] = TransferTable
-WRITTEN[AbstractTransfer] = {"sampled": SampledTable, "preset": PresetTable, "window": WindowTable, "file": TransferFile}
+WRITTEN[AbstractTransfer] = {
+    "sampled": SampledTable,
+    "preset": PresetTable,
+    "window": WindowTable,
+    "slicer": SlicerTable,
+    "paraview": ParaViewTable,
+    "file": TransferFile,
+}
 Transfer = Annotated[Any, part(AbstractTransfer)]
