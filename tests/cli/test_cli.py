@@ -359,6 +359,7 @@ def test_an_installed_wheel_has_the_demo(tmp_path):
         repository / "configs" / "demo.toml"
     ).read_text(encoding="utf-8")
     assert "jvr demo" in done.stdout
+    assert (installed / "jvr" / "io" / "interop" / "slicer.toml").is_file()
     # A package that the wheel forgets is still there for everyone who works in the repository.
     modules = lambda root: {path.relative_to(root).as_posix() for path in (root / "jvr").rglob("*.py")}
     assert modules(installed) == modules(repository)

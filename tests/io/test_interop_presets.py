@@ -152,6 +152,12 @@ def test_what_jvr_holds_comes_back_from_vtk_exactly(encoding):
         for ours, again in zip(evaluated(transfer, x), evaluated(found.transfer, x), strict=True):
             # Opacities near 1 keep few digits of the extinction in single precision.
             np.testing.assert_allclose(again, ours, rtol=1e-4, atol=3e-6)
+        rgb, sigma = evaluated(transfer, x)
+        theirs = np.array([made.GetScalarOpacity().GetValue(s) for s in x])
+        np.testing.assert_allclose(theirs, 1 - np.exp(-0.8 * sigma), atol=ERROR + 1e-5)
+        shown = jvr.srgb_from_linear(rgb) if encoding == "srgb" else rgb
+        colours = np.array([made.GetRGBTransferFunction().GetColor(s) for s in x])
+        np.testing.assert_allclose(colours, shown, atol=ERROR + 1e-5)
         assert jax.tree.all(jax.tree.map(lambda a, b: np.isclose(a, b, rtol=1e-6), found.shading, given.shading))
         assert found.unit_distance == 0.8
         assert isinstance(found.interpolation, jvr.Trilinear)
@@ -236,6 +242,13 @@ def test_opacity_by_gradient():
     function.AddPoint(0, 0.5)
     with pytest.warns(UserWarning, match="not kept: opacity by gradient"):
         assert isinstance(interop.from_vtk_property(made).transfer, jvr.LinearTransfer)
+
+
+def test_grey_functions_of_vtk_are_colours():
+    grey, opacity = of_vtk(np.array([[0, 0.2, 0.5, 0], [9, 0.6, 0.5, 0]])), of_vtk(np.array([[0, 0.5, 0.5, 0]]))
+    preset = interop.from_vtk_property(property_of_vtk(opacity, grey))
+    assert preset.lost == {}
+    np.testing.assert_allclose(evaluated(preset.transfer, [-1, 4.5, 9])[0], [[0.2] * 3, [0.4] * 3, [0.6] * 3], atol=1e-6)
 
 
 def test_what_vtk_says_and_jvr_does_not_hold_is_named():
