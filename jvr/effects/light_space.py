@@ -18,10 +18,10 @@ from jaxtyping import Array, Float
 from jvr.execution.devices import over_rays, shares
 from jvr.march.medium import Medium
 from jvr.march.secondary import SecondaryRays, channel_count, secondary_rays, take_midpoint
-from jvr.model.light import AbstractDeltaLight, DirectionalLight, perpendicular
+from jvr.model.light import AbstractDeltaLight, DirectionalLight
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.numerics import clamp, direction_and_length, dot
+from jvr.numerics import clamp, direction_and_length, dot, perpendicular
 from jvr.types import Channels, Scalar, Triple, Vector
 
 Result = TypeVar("Result")

@@ -19,9 +19,8 @@ from jvr.march.secondary import SecondaryRays, channel_count, points, secondary_
 from jvr.march.segments import classify_at
 from jvr.model.clipping import ClippingBox
 from jvr.model.harmonics.basis import basis
-from jvr.model.light import perpendicular
 from jvr.model.volume import Volume
-from jvr.numerics import direction_and_length, one_minus_exp
+from jvr.numerics import direction_and_length, one_minus_exp, perpendicular
 from jvr.types import Channels, Triple
 
 Numbers: TypeAlias = Float[Array, "..."]
