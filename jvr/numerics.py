@@ -113,6 +113,16 @@ def dot(a: Triple, b: Triple) -> Float[Array, "..."]:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def perpendicular(axis: Triple) -> tuple[Triple, Triple]:
+    """Two unit vectors that make an orthonormal basis with a unit vector (Duff et al. 2017, JCGT 6:1)."""
+    x, y, z = axis
+    # No branch, and no division by a small number.
+    sign = jnp.where(z < 0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
 def power_of_cosine(a: Triple, b: Triple, exponent: Float[Array, "..."]) -> Float[Array, "..."]:
     """`max(a . b, 0)^exponent` of unit vectors.
 

@@ -39,6 +39,18 @@ def _programs_go():
     gc.collect()
 
 
+@pytest.fixture(scope="module")
+def _registry():
+    """Classes that are registered by the tests of a file are known to them, and not to others."""
+    from jvr.io.kinds import KINDS, PARTS
+
+    known = dict(PARTS), {family: dict(kinds) for family, kinds in KINDS.items()}
+    yield
+    for here, before in zip((PARTS, KINDS), known, strict=True):
+        here.clear()
+        here.update(before)
+
+
 @pytest.fixture
 def x64():
     """Double precision for one test."""

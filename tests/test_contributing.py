@@ -12,7 +12,6 @@ import pytest
 from scenes import render
 
 import jvr
-from jvr.io import kinds
 from jvr.io.config import build_scene, build_settings, read_config
 from jvr.model.phase import ScatteringAngle
 
@@ -20,19 +19,15 @@ PAGE = "CONTRIBUTING.md"
 
 
 @pytest.fixture(scope="module", autouse=True)
-def added():
-    """The module of the page, in which lines are those of the page. What it registers goes with the tests of this file."""
+def added(_registry):
+    """The module of the page, in which lines are those of the page."""
     module = types.ModuleType("added")
-    known = dict(kinds.PARTS), {family: dict(names) for family, names in kinds.KINDS.items()}
     sys.modules["added"] = module
     for block in pages.blocks("python"):
         if block.page == PAGE:
             exec(compile("\n" * (block.line - 1) + block.code, PAGE, "exec"), vars(module))
     yield module
     del sys.modules["added"]
-    for here, before in zip((kinds.PARTS, kinds.KINDS), known, strict=True):
-        here.clear()
-        here.update(before)
 
 
 # --- Each is what it says, by closed forms ---------------------------------------------------------------------------

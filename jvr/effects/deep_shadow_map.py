@@ -10,12 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.effects.light_space import AbstractLightSpace, bilinear, light_space, of_swept
-from jvr.effects.shadow_volume import texels
+from jvr.effects.shadow_volume import knobs_of_layers, texels
 from jvr.march.medium import AbstractVisibility, LightPath
 from jvr.march.steps import Point, Transmittances
 from jvr.model.effects import AbstractShadows
 from jvr.model.parameters import assign, choice
-from jvr.model.parts import Knob, multiples
+from jvr.model.parts import Knob
 from jvr.model.ranges import AT_LEAST_ONE, FRACTION
 from jvr.model.scene import Scene
 from jvr.numerics import read_run, transformed
@@ -63,9 +63,7 @@ class DeepShadowMap(AbstractShadows):
             yield f"{share:.0%} of the rays of a deep shadow map ran out of layers (error {error:.2g}): give it more"
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
-        return multiples("texels", self.texels, (1 / 2, 1, 2), 3, least=2), multiples(
-            "layers", self.layers, (1 / 2, 1, 2), 3, least=1
-        )
+        return knobs_of_layers(self.texels, self.layers)
 
 
 class ShadowStats(NamedTuple):

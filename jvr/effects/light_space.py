@@ -17,12 +17,11 @@ from jaxtyping import Array, Float
 
 from jvr.execution.devices import over_rays, shares
 from jvr.march.medium import Medium
-from jvr.march.segments import classify_at
-from jvr.march.steps import Point
-from jvr.model.light import AbstractDeltaLight, DirectionalLight, perpendicular
+from jvr.march.secondary import SecondaryRays, channel_count, secondary_rays, take_midpoint
+from jvr.model.light import AbstractDeltaLight, DirectionalLight
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.numerics import clamp, direction_and_length, dot, larger, ray_box, rounded_into, smaller
+from jvr.numerics import clamp, direction_and_length, dot, perpendicular
 from jvr.types import Channels, Scalar, Triple, Vector
 
 Result = TypeVar("Result")
@@ -121,46 +120,21 @@ def light_space(light: AbstractDeltaLight, volume: Volume) -> AbstractLightSpace
 
 
 class LightRays(NamedTuple):
-    """A batch of a light's rays: start and direction in grid coordinates, length in the world, and the stretch of it inside of the volume
-    (and its clipping box), of no length where there is none."""
+    """A batch of a light's rays, which go on without an end, and their lengths from `w = 0` to `w = 1`."""
 
-    start: Triple
-    direction: Triple
+    rays: SecondaryRays
     length: Float[Array, "rays"]
-    enters: Float[Array, "rays"]
-    leaves: Float[Array, "rays"]
 
 
 def rays_through(space: AbstractLightSpace, scene: Scene, u: Float[Array, "rays"], v: Float[Array, "rays"]) -> LightRays:
     """The rays `(u, v)` of a light."""
-    volume, clipping = scene.volume, scene.clipping
 
     def one(u: Scalar, v: Scalar) -> LightRays:
         x, direction, length = space.ray(u, v)
-        p, along = volume.grid_from_world(x), volume.grid_from_world(direction, direction=True)
-        enters, leaves = ray_box(p, along, *volume.domain)
-        if clipping is not None:
-            near, far = ray_box(x, direction, tuple(clipping.lower), tuple(clipping.upper))
-            enters, leaves = larger(enters, near), smaller(leaves, far)
-        hit = leaves > enters
-        return LightRays(p, along, length, jnp.where(hit, enters, 0.0), jnp.where(hit, leaves, 0.0))
+        grid = scene.volume.grid_from_world(x), scene.volume.grid_from_world(direction, direction=True)
+        return LightRays(secondary_rays(scene.volume, scene.clipping, (x, direction), grid), length)
 
     return jax.vmap(one)(u, v)
-
-
-def depth_between(
-    medium: Medium, volume: Volume, rays: LightRays, begin: Float[Array, "rays"], end: Float[Array, "rays"]
-) -> Channels:
-    """Optical depth of each ray between two depths `w`, by one sample in the middle of what of that is inside of the volume: exact where
-    the medium is homogeneous, and continuous where a border moves."""
-    low, high = (smaller(larger(w * rays.length, rays.enters), rays.leaves) for w in (begin, end))
-    middle, inside = 0.5 * (low + high), high > low
-    p = (s + middle * d for s, d in zip(rays.start, rays.direction, strict=True))
-    # Where nothing is inside, and by a rounding elsewhere, the middle may be outside, where nothing may be read.
-    p = tuple(rounded_into(c, first, last) for c, first, last in zip(p, *volume.domain, strict=True))
-    point = Point(p, rays.direction, *(jnp.zeros_like(middle, jnp.int32),) * 2)
-    sigma_t = classify_at(medium, point, inside)[0].sigma_t
-    return tuple(jnp.where(inside, sigma * (high - low), 0.0) for sigma in sigma_t)
 
 
 def depth_nodes(
@@ -204,24 +178,23 @@ def _swept(
 ) -> Float[Array, "rays nodes channels"]:
     """`depth_nodes` of the rays at some coordinates `(u, v)`."""
     u, v = coordinates.T
-    rays = rays_through(space, scene, u, v)
+    light = rays_through(space, scene, u, v)
     together = min(max(1, SWEPT // (u.size * samples)), layers)
     blocks = -(-layers // together)
-    of_all = jax.tree.map(lambda x: jnp.tile(x, together * samples), rays)
+    rays, length = jax.tree.map(lambda x: jnp.tile(x, together * samples), light)
 
     # Checkpointed: the reverse pass computes a block of layers again rather than keep all of its voxels.
     @jax.checkpoint
     def sweep(tau: Channels, block: Array) -> tuple[Channels, Channels]:
         steps = block * together * samples + jnp.arange(together * samples, dtype=u.dtype)
-        begin, end = (jnp.repeat(steps + half, u.size) / (samples * layers) for half in (0, 1))
-        dtau = depth_between(medium, scene.volume, of_all, begin, end)
+        begin, end = (jnp.repeat(steps + one, u.size) / (samples * layers) * length for one in (0, 1))
+        dtau = take_midpoint(medium, scene.volume, rays, begin, end, True)[0]
         depths = tuple(
             t + jnp.cumsum(jnp.sum(d.reshape(together, samples, -1), axis=1), axis=0) for t, d in zip(tau, dtau, strict=True)
         )
         return tuple(d[-1] for d in depths), depths
 
-    channels = jax.eval_shape(lambda: depth_between(medium, scene.volume, rays, u, v))
-    zero = tuple(jnp.zeros(u.shape, c.dtype) for c in channels)
+    zero = (jnp.zeros_like(light.length),) * channel_count(medium, scene.volume, rays)
     _, depths = jax.lax.scan(sweep, zero, jnp.arange(blocks, dtype=u.dtype))
     swept = [jnp.concatenate([z[None], d.reshape(-1, u.size)[:layers]]) for z, d in zip(zero, depths, strict=True)]
     return jnp.moveaxis(jnp.stack(swept, axis=-1), 0, 1)

@@ -1,6 +1,7 @@
 """The projection of radiance transfer at nodes: rays that are sent out from each, and what they carry, as spherical harmonics (Lindemann
 and Ropinski 2010, section 4.1)."""
 
+import functools
 import itertools
 import math
 from typing import Any, NamedTuple, TypeAlias
@@ -14,13 +15,12 @@ from jvr.effects.environment_lighting import EnvironmentLighting
 from jvr.effects.radiance_transfer import RadianceTransfer
 from jvr.effects.shading import surface_weight
 from jvr.march.medium import Medium
+from jvr.march.secondary import SecondaryRays, channel_count, points, secondary_rays, take_midpoint
 from jvr.march.segments import classify_at
-from jvr.march.steps import Point
 from jvr.model.clipping import ClippingBox
 from jvr.model.harmonics.basis import basis
-from jvr.model.light import perpendicular
 from jvr.model.volume import Volume
-from jvr.numerics import direction_and_length, larger, one_minus_exp, ray_box, rounded_into, smaller
+from jvr.numerics import direction_and_length, one_minus_exp, perpendicular
 from jvr.types import Channels, Triple
 
 Numbers: TypeAlias = Float[Array, "..."]
@@ -71,8 +71,10 @@ def project_nodes(
     along = tuple(d.ravel() for d in directions)
     lift = volume.grid_from_world(tuple(strength * radiance_transfer.lift(volume) * c for c in around.axis), direction=True)
     origins = tuple(c + d for c, d in zip(nodes, lift, strict=True))
-    rays = _rays(volume, clipping, tuple(map(wide, origins)), along)
-    carried = _carried(radiance_transfer, volume, medium, albedo, rays)
+    origins = tuple(map(wide, origins))
+    grid = origins, volume.grid_from_world(along, direction=True)
+    rays = secondary_rays(volume, clipping, (volume.world_from_point(origins), along), grid)
+    carried = _carried(radiance_transfer, volume, medium, albedo, rays, tuple(-d for d in along))
     functions = jnp.stack(basis(radiance_transfer.order, directions), axis=-1)
     # Each sample counts by the inverse of its density, 2 pi (1 + sin alpha). Directions without rays count as the mean of those with: no
     # light of theirs is reflected, and a step at the horizon would ring. What is the same from everywhere has no error of the quadrature.
@@ -107,7 +109,7 @@ def _surroundings(radiance_transfer: RadianceTransfer, volume: Volume, medium: M
     step = 1 / radiance_transfer.resolution
     at = [jnp.clip(c[:, None] + step * o, low, high) for c, o, low, high in zip(p, offsets.T, lower, upper, strict=True)]
     flat = tuple(c.ravel() for c in at)
-    sigma_t = classify_at(medium, _points(flat, flat), jnp.ones(flat[0].shape, bool))[0].sigma_t
+    sigma_t = classify_at(medium, points(flat, flat), jnp.ones(flat[0].shape, bool))[0].sigma_t
     tau = (width * sum(sigma_t[1:], sigma_t[0]) / len(sigma_t)).reshape(p[0].shape[0], -1)
     # Not 1 less the transparency: thin media keep their digits.
     opacity = one_minus_exp(tau)
@@ -142,45 +144,23 @@ def _spread(cone: Cone, rays: int) -> Triple:
     return tuple(u * a[i][:, None] + v * b[i][:, None] + cosine * cone.axis[i][:, None] for i in range(3))
 
 
-class _Rays(NamedTuple):
-    """Rays from nodes: grid position, direction in the world and in the grid, and the distances between which there is a medium."""
-
-    p: Triple
-    direction: Triple
-    along: Triple
-    t_in: Numbers
-    t_out: Numbers
-
-
-def _rays(volume: Volume, clipping: ClippingBox | None, p: Triple, direction: Triple) -> _Rays:
-    along = volume.grid_from_world(direction, direction=True)
-    t_in, t_out = ray_box(p, along, *volume.domain)
-    if clipping is not None:
-        near, far = ray_box(volume.world_from_point(p), direction, tuple(clipping.lower), tuple(clipping.upper))
-        t_in, t_out = larger(t_in, near), smaller(t_out, far)
-    t_in = larger(t_in, 0.0)
-    hit = t_out > t_in
-    return _Rays(p, direction, along, jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0))
-
-
 def _carried(
-    radiance_transfer: RadianceTransfer, volume: Volume, medium: Medium, albedo: EnvironmentLighting | None, rays: _Rays
+    radiance_transfer: RadianceTransfer,
+    volume: Volume,
+    medium: Medium,
+    albedo: EnvironmentLighting | None,
+    rays: SecondaryRays,
+    toward_origin: Triple,
 ) -> Channels:
-    """What rays carry from far away to grid positions: transmittance, or with bleeding white light behind the colours of what they pass."""
+    """What rays carry from far away to where they begin: transmittance, or with bleeding white light behind the colours of what they pass.
+    `toward_origin`: unit directions in the world."""
     ends = jnp.asarray(radiance_transfer.boundaries(volume.shape), rays.t_out.dtype) * 2 * volume.radius
     opaque = -math.log(radiance_transfer.termination) if radiance_transfer.termination > 0 else math.inf
-    lower, upper = volume.domain
-    toward_origin = tuple(-d for d in rays.direction)
+    is_clear = lambda tau: functools.reduce(jnp.minimum, tau) < opaque
 
     def one_step(state: tuple[Channels, Channels], ends: tuple[Numbers, Numbers]) -> tuple[Channels, Channels]:
         tau, colour = state
-        begin, end = (smaller(larger(rays.t_in, e), rays.t_out) for e in ends)
-        middle = 0.5 * (begin + end)
-        # By a rounding the middle may be outside, where nothing may be read.
-        at = tuple(rounded_into(c + middle * d, a, b) for c, d, a, b in zip(rays.p, rays.along, lower, upper, strict=True))
-        inside = (end > begin) & (_least(tau) < opaque)
-        classified, sample = classify_at(medium, _points(at, rays.along), inside)
-        dtau = tuple(jnp.where(inside, sigma * (end - begin), 0.0) for sigma in classified.sigma_t)
+        dtau, classified, sample = take_midpoint(medium, volume, rays, *ends, is_clear(tau))
         if colour:
             rgb = _colour(classified.rgb, sample, albedo, toward_origin)
             before = [jnp.exp(-t) for t in tau] * (3 // len(tau))
@@ -191,11 +171,11 @@ def _carried(
     # Checkpointed: the reverse pass computes a step again rather than keep all of its voxels.
     @jax.checkpoint
     def step(state: tuple[Channels, Channels], ends: tuple[Numbers, Numbers]) -> tuple[tuple[Channels, Channels], None]:
-        alive = (ends[0] < rays.t_out) & (ends[1] > rays.t_in) & (_least(state[0]) < opaque)
+        alive = (ends[0] < rays.t_out) & (ends[1] > rays.t_in) & is_clear(state[0])
         return jax.lax.cond(jnp.any(alive), lambda s: one_step(s, ends), lambda s: s, state), None
 
     zero = jnp.zeros_like(rays.t_out)
-    channels = len(jax.eval_shape(lambda: classify_at(medium, _points(rays.p, rays.along), zero > 0)[0].sigma_t))
+    channels = channel_count(medium, volume, rays)
     state = ((zero,) * channels, () if radiance_transfer.bleeding is None else (zero,) * 3)
     (tau, colour), _ = jax.lax.scan(step, state, (ends[:-1], ends[1:]))
     clear = tuple(jnp.exp(-t) for t in tau)
@@ -215,15 +195,3 @@ def _colour(rgb: Triple, sample: Any, albedo: EnvironmentLighting | None, w_o: T
     gradient = sample.gradient or (jnp.zeros_like(sample.s),) * 3
     tinted, unmodulated = jax.vmap(one)(sample.s, gradient, w_o)
     return tuple(c * a + b for c, a, b in zip(rgb, tinted, unmodulated, strict=True))
-
-
-def _least(tau: Channels) -> Numbers:
-    """Optical depth of the clearest channel."""
-    least = tau[0]
-    for t in tau[1:]:
-        least = jnp.minimum(least, t)
-    return least
-
-
-def _points(p: Triple, along: Triple) -> Point:
-    return Point(p, along, *(jnp.zeros_like(p[0], jnp.int32),) * 2)

@@ -11,14 +11,14 @@ from jvr.march.fields import VoxelField
 from jvr.march.march import Marched, MarchOptions, march
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Rays, Transmittances
-from jvr.model.clipping import ClippingBox
+from jvr.model.clipping import ClippingBox, interval_inside
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractDeltaLight
 from jvr.model.parameters import assign, choice
 from jvr.model.parts import AbstractPart, Knob, multiples
 from jvr.model.ranges import POSITIVE, TRANSMITTANCE
 from jvr.model.scene import Scene
-from jvr.numerics import ray_box, smaller
+from jvr.numerics import smaller
 from jvr.types import Channels, Scalar
 
 
@@ -77,16 +77,14 @@ class RayVisibility(AbstractVisibility):
 
     def _rays(self, light: AbstractDeltaLight, points: Point, wanted: Bool[Array, "rays"]) -> Rays:
         """From the points to a light; without length where they are not wanted."""
-        field, clipping = self.medium.field, self.clipping
+        field = self.medium.field
         assert isinstance(field, VoxelField)
         volume = field.volume
         x = volume.world_from_point(points.p)
         # No light that casts shadows depends on where the eye is.
         w_i, distance, _ = jax.vmap(lambda x: light.sample(x, x))(x)
         along = volume.grid_from_world(w_i, direction=True)
-        length = smaller(ray_box(points.p, along, *volume.domain)[1], distance)
-        if clipping is not None:
-            length = smaller(length, ray_box(x, w_i, tuple(clipping.lower), tuple(clipping.upper))[1])
+        length = smaller(interval_inside(volume, self.clipping, (x, w_i), (points.p, along))[1], distance)
         reaches = wanted & (length > 0)
         keep = lambda v: tuple(jnp.where(reaches, c, 0.0) for c in v)
         return Rays(keep(points.p), keep(along), jnp.where(reaches, length, 0.0))

@@ -25,6 +25,12 @@ def texels() -> Any:
     return choice(Interval(low=2.0), doc="rays along each axis of the map")
 
 
+def knobs_of_layers(texels: int, layers: int) -> tuple[Knob, ...]:
+    """What can be turned of a map with layers."""
+    halves = (1 / 2, 1, 2)
+    return multiples("texels", texels, halves, 3, least=2), multiples("layers", layers, halves, 3, least=1)
+
+
 class ShadowVolume(AbstractShadows):
     """A volume of transmittance, swept away from the light (Behrens and Ratering 1998, in the light's own coordinates).
 
@@ -70,9 +76,7 @@ class OpacityShadowMap(AbstractShadows):
         return depth_visibility(scene, path, self.texels, self.layers, samples_a_layer(scene, self.layers))
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
-        return multiples("texels", self.texels, (1 / 2, 1, 2), 3, least=2), multiples(
-            "layers", self.layers, (1 / 2, 1, 2), 3, least=1
-        )
+        return knobs_of_layers(self.texels, self.layers)
 
 
 class ClearGrid(eqx.Module):

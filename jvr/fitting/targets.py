@@ -46,7 +46,7 @@ def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "ta
             raise ValueError(f"{name} {i} has four channels: give light over the scene's background, (height, width, 3)")
         if not np.all(np.isfinite(image)):
             raise ValueError(
-                f"{name} {i} has {np.sum(~np.isfinite(image))} values that are not finite: give them weight 0 and replace them"
+                f"{name} {i} has {np.sum(~np.isfinite(image))} values that are not finite: replace them (jvr.fit takes them with weight 0)"
             )
     _say_what_no_scene_gives(arrays, name)
     return arrays

@@ -96,8 +96,7 @@ class PerspectiveCamera(AbstractCamera):
         *,
         remainder: Remainder | None = None,
     ):
-        self.world_from_camera = affine(world_from_camera, "world_from_camera")
-        self.remainder = Remainder.left(world_from_camera, self.world_from_camera, remainder)
+        _place(self, world_from_camera, remainder)
         assign(self, fov_y=fov_y, width=width, height=height)
 
     @classmethod
@@ -141,8 +140,7 @@ class PinholeCamera(AbstractCamera):
         principal_point: ArrayLike | None = None,
         remainder: Remainder | None = None,
     ):
-        self.world_from_camera = affine(world_from_camera, "world_from_camera")
-        self.remainder = Remainder.left(world_from_camera, self.world_from_camera, remainder)
+        _place(self, world_from_camera, remainder)
         middle = (width / 2, height / 2) if principal_point is None else principal_point
         # A size of zero would be blamed on the focal length that somebody made of it.
         assign(self, width=width, height=height, focal_lengths=focal_lengths, principal_point=middle)
@@ -175,8 +173,7 @@ class OrthographicCamera(AbstractCamera):
         *,
         remainder: Remainder | None = None,
     ):
-        self.world_from_camera = affine(world_from_camera, "world_from_camera")
-        self.remainder = Remainder.left(world_from_camera, self.world_from_camera, remainder)
+        _place(self, world_from_camera, remainder)
         assign(self, height_world=height_world, width=width, height=height)
 
     @classmethod
@@ -193,6 +190,12 @@ class OrthographicCamera(AbstractCamera):
         forward = _rotate(self.world_from_camera, (jnp.zeros_like(x), jnp.zeros_like(x), -jnp.ones_like(x)))
         origin = tuple(a + c for a, c in zip(aside, self.axis_at(ahead), strict=True))
         return origin, forward, jnp.broadcast_to(ahead, x.shape)
+
+
+def _place(camera: Any, world_from_camera: ArrayLike, remainder: Remainder | None) -> None:
+    """Gives a camera its pose, in its constructor."""
+    camera.world_from_camera = affine(world_from_camera, "world_from_camera")
+    camera.remainder = Remainder.left(world_from_camera, camera.world_from_camera, remainder)
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Affine:

@@ -1,15 +1,21 @@
 """The part of the world that is rendered."""
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jvr.model.checks import require
 from jvr.model.exact import Exact, Remainder
 from jvr.model.parameters import assign, parameter
 from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.ranges import UNLIMITED
-from jvr.types import ArrayLike, Vector
+from jvr.model.volume import Volume
+from jvr.numerics import larger, ray_box, smaller
+from jvr.types import ArrayLike, Triple, Vector
+
+# Where a ray begins, and its direction for each unit of world length.
+Line: TypeAlias = tuple[Triple, Triple]
 
 
 class ClippingBox(AbstractPart):
@@ -39,3 +45,15 @@ class ClippingBox(AbstractPart):
         # A face that is infinitely far away stays there.
         lower, upper = (jnp.where(jnp.isfinite(x), Exact(x, rest.beside(x)).minus(origin).rounded(), x) for x, rest in corners)
         return ClippingBox(lower, upper)
+
+
+def interval_inside(
+    volume: Volume, clipping: ClippingBox | None, world: Line, grid: Line
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Distances at which a ray enters and leaves what is rendered of a volume, as those of `jvr.numerics.ray_box`. `world`, `grid`: the ray
+    in coordinates of either."""
+    near, far = ray_box(*grid, *volume.domain)
+    if clipping is None:
+        return near, far
+    enters, leaves = ray_box(*world, tuple(clipping.lower), tuple(clipping.upper))
+    return larger(near, enters), smaller(far, leaves)

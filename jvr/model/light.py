@@ -20,7 +20,7 @@ from jvr.model.parameters import GREY_OR_RGB, assign, declared, parameter
 from jvr.model.parts import AbstractPart, PlanEntry, is_zero
 from jvr.model.ranges import DEGREES, DIRECTION, NOT_NEGATIVE, POSITIVE, RADIANCE, Entries
 from jvr.names import Renamed
-from jvr.numerics import direction_and_length, divide_or_zero
+from jvr.numerics import direction_and_length, divide_or_zero, perpendicular
 from jvr.types import ArrayLike, Scalar, Triple, Vector
 
 
@@ -267,15 +267,6 @@ def _spread(position: ArrayLike, radius: float, intensity: ArrayLike, offsets: F
     float_array(position, "position", (3,))
     center, n = in_double(position), offsets.shape[0]
     return tuple(PointLight(center + radius * in_double(offset), radiances(intensity, "intensity") / n) for offset in offsets)
-
-
-def perpendicular(axis: Triple) -> tuple[Triple, Triple]:
-    """Two unit vectors that make an orthonormal basis with a unit vector (Duff et al. 2017, JCGT 6:1)."""
-    x, y, z = axis
-    sign = jnp.where(z >= 0, 1.0, -1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
 
 
 def _at(light: Any, origin: Exact) -> Any:

@@ -20,7 +20,7 @@ from jvr.model.by_value import ByValue
 from jvr.model.checks import require
 from jvr.model.parameters import GREY_OR_RGB, assign, parameter
 from jvr.model.ranges import ASYMMETRY, NOT_NEGATIVE, UNIT_INTERVAL
-from jvr.numerics import divide_or_zero
+from jvr.numerics import divide_or_zero, dot, perpendicular
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 Numbers: TypeAlias = Float[Array, "..."]
@@ -49,7 +49,7 @@ class ScatteringAngle(NamedTuple):
         `1 -+ cos theta = |w_o +- w_i|^2 / 2`, which does not cancel."""
         sums = tuple(o + i for o, i in zip(w_o, w_i, strict=True))
         differences = tuple(o - i for o, i in zip(w_o, w_i, strict=True))
-        return cls.of_gaps(0.5 * _dot(sums, sums), 0.5 * _dot(differences, differences))
+        return cls.of_gaps(0.5 * dot(sums, sums), 0.5 * dot(differences, differences))
 
     @classmethod
     def of_cosine(cls, cos: Numbers) -> "ScatteringAngle":
@@ -103,8 +103,8 @@ class AbstractPhase(eqx.Module):
         sine = jnp.sqrt(angle.one_minus * angle.one_plus)
         local = (sine * jnp.cos(azimuth), sine * jnp.sin(azimuth), angle.cos)
         # The rows of the frame about `travel`: component by component of the direction.
-        rows = zip(*_tangents(travel), travel, strict=True)
-        return tuple(_dot(local, row) for row in rows), angle
+        rows = zip(*perpendicular(travel), travel, strict=True)
+        return tuple(dot(local, row) for row in rows), angle
 
 
 class Isotropic(AbstractPhase):
@@ -344,16 +344,3 @@ def _schlick_mean(k: Numbers) -> Numbers:
     series = k * jnp.polyval(jnp.array([2.0 / (4 * n * n - 1) for n in range(14, 0, -1)], k.dtype), k * k)
     large = jnp.where(small, 0.5, k)
     return jnp.where(small, series, (1.0 - (1.0 - large) * (1.0 + large) * jnp.arctanh(large) / large) / large)
-
-
-def _dot(a: Triple, b: Triple) -> Numbers:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _tangents(n: Triple) -> tuple[Triple, Triple]:
-    # Duff et al. 2017, Building an orthonormal basis, revisited: no branch and no division by a small number.
-    x, y, z = n
-    sign = jnp.where(z < 0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.execution.devices import everywhere, over_rays, shares
+from jvr.execution.devices import everywhere, over_rays, program, shares
 from jvr.execution.tiles import block_shape, dealt_blocks, in_tiles, picture_of, pixels_of
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
@@ -23,7 +23,7 @@ from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero
 from jvr.rendering.image import Rendering, RenderStats
 from jvr.rendering.medium import Prepared, prepare
-from jvr.rendering.trace import camera_rays
+from jvr.rendering.trace import camera_rays, near_volume
 from jvr.types import Scalar
 
 if TYPE_CHECKING:
@@ -80,14 +80,13 @@ class AbstractIntegrator(AbstractPart):
 
     def render(self, scene: Scene, camera: AbstractCamera, settings: "Settings") -> Rendering:
         """`jvr.render` by this integrator, as it was called before; for one release, with a warning."""
-        from jvr.rendering.render import render
-
         warnings.warn(
             f"{type(self).__name__}.render is jvr.render(scene, camera, settings) with Settings(sampling=...)",
             DeprecationWarning,
             stacklevel=2,
         )
-        return render(scene, camera, dataclasses.replace(settings, sampling=self))
+        same = dataclasses.replace(settings, sampling=self, step=1.0)
+        return compiled_picture(scene.current(), camera, same, settings.step)
 
 
 class AbstractRayIntegrator(AbstractIntegrator):
@@ -127,3 +126,12 @@ class AbstractRayIntegrator(AbstractIntegrator):
         rays, t_in = camera_rays(prepared.scene, camera, pixels)
         found = self.radiance(prepared, rays)
         return found.rgb, found.alpha, found.depth(t_in), found.steps
+
+
+def make_picture(scene: Scene, camera: AbstractCamera, settings: "Settings", step: Scalar | float) -> Rendering:
+    """The picture that the integrator of `settings` makes. Traceable. `settings`: with a step of 1, in place of which there is `step`."""
+    scene, camera = near_volume(scene, camera)
+    return settings.sampling.picture(View(scene, camera, settings, step * jnp.min(scene.volume.spacing)))
+
+
+compiled_picture = program(make_picture, static_argnums=2)

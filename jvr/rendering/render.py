@@ -2,17 +2,13 @@
 
 import dataclasses
 
-import jax.numpy as jnp
-
-from jvr.execution.devices import is_spread, is_traced, program
+from jvr.execution.devices import is_spread, is_traced
 from jvr.execution.tiles import within_memory
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.rendering.image import Rendering
-from jvr.rendering.integrator import View
+from jvr.rendering.integrator import compiled_picture, make_picture
 from jvr.rendering.settings import Settings
-from jvr.rendering.trace import near_volume
-from jvr.types import Scalar
 
 
 def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()) -> Rendering:
@@ -31,16 +27,8 @@ def render(scene: Scene, camera: AbstractCamera, settings: Settings = Settings()
     scene, step, same = scene.current(), settings.step, dataclasses.replace(settings, step=1.0)
     if is_traced() and not is_spread():
         # A part of somebody's program, in which arrays that it closes over are constants.
-        return _render(scene, camera, same, step)
+        return make_picture(scene, camera, same, step)
     if is_traced((scene, camera)) or is_spread() or not settings.sampling.is_tiled:
         # Inside of `jax.grad`, `jax.vmap` or `jax.shard_map` alone: they take a compiled program as a single operation.
-        return _picture(scene, camera, same, step)
-    return within_memory(lambda tile: _picture(scene, camera, dataclasses.replace(same, tile=tile), step), settings.tile)
-
-
-def _render(scene: Scene, camera: AbstractCamera, settings: Settings, step: Scalar | float) -> Rendering:
-    scene, camera = near_volume(scene, camera)
-    return settings.sampling.picture(View(scene, camera, settings, step * jnp.min(scene.volume.spacing)))
-
-
-_picture = program(_render, static_argnums=2)
+        return compiled_picture(scene, camera, same, step)
+    return within_memory(lambda tile: compiled_picture(scene, camera, dataclasses.replace(same, tile=tile), step), settings.tile)

@@ -10,8 +10,9 @@ from jaxtyping import Array, Float, Int
 from jvr.march.march import Marched
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
+from jvr.model.clipping import interval_inside
 from jvr.model.scene import Scene
-from jvr.numerics import larger, one_minus_exp, ray_box, smaller
+from jvr.numerics import larger, one_minus_exp
 from jvr.types import Scalar, Triple
 
 if TYPE_CHECKING:
@@ -68,10 +69,7 @@ def enter(
     """
     start = scene.volume.grid_from_world(origin)
     along = scene.volume.grid_from_world(direction, direction=True)
-    t_in, t_out = ray_box(start, along, *scene.volume.domain)
-    if scene.clipping is not None:
-        near, far = ray_box(origin, direction, tuple(scene.clipping.lower), tuple(scene.clipping.upper))
-        t_in, t_out = larger(t_in, near), smaller(t_out, far)
+    t_in, t_out = interval_inside(scene.volume, scene.clipping, (origin, direction), (start, along))
     t_in = larger(t_in, -behind)
     hit = t_out > t_in
     # A ray that misses gets harmless numbers before any arithmetic, so that its derivative is zero and not 0 * inf.

@@ -11,23 +11,18 @@ from scenes import render
 
 import jvr
 from jvr.io.config import build_scene, build_settings, read_config
-from jvr.io.kinds import KINDS, PARTS
 from jvr.model.effects import AbstractShading
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.ranges import UNIT_INTERVAL
-from jvr.rendering.integrator import AbstractIntegrator, AbstractRayIntegrator, Radiance
+from jvr.rendering.integrator import AbstractRayIntegrator, Radiance
 from jvr.rendering.marching import Uniform
 from jvr.types import Scalar
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _registered():
-    """Known to files while these tests run, and not to others."""
+def _registered(_registry):
     jvr.register("chalk", Chalk)
     jvr.register("front", Front)
-    yield
-    for family, kind, name in ((AbstractShading, "chalk", "Chalk"), (AbstractIntegrator, "front", "Front")):
-        del KINDS[family][kind], PARTS[name]
 
 
 class Chalk(AbstractShading):

@@ -28,23 +28,63 @@ def sky(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"),
+    ("key", "text", "wanted"),
     [
-        ("'constant'", jvr.EnvironmentLight.constant()),
-        ("{kind='constant',radiance=[1,2,3],order=2}", jvr.EnvironmentLight.constant([1, 2, 3], order=2)),
-        (DISC, jvr.EnvironmentLight.disc([0, 0, 1], 20)),
+        ("environment", "'constant'", jvr.EnvironmentLight.constant()),
+        ("environment", "{kind='constant',radiance=[1,2,3],order=2}", jvr.EnvironmentLight.constant([1, 2, 3], order=2)),
+        ("environment", DISC, jvr.EnvironmentLight.disc([0, 0, 1], 20)),
         (
+            "environment",
             "{kind='disc',towards=[0,0,1],half_angle=20,radiance=[1,2,3],order=1}",
             jvr.EnvironmentLight.disc([0, 0, 1], 20, [1, 2, 3], order=1),
         ),
         (
+            "environment",
             "{kind='disc',towards=[0,0,1],half_angle=20,clamped=false}",
             jvr.EnvironmentLight(jvr.EnvironmentLight.disc([0, 0, 1], 20).coefficients, clamped=False),
         ),
+        ("material", "'lambert'", jvr.LambertBRDF()),
+        ("material", "{kind='lambert',reflectance=[0.1,0.2,0.3]}", jvr.LambertBRDF([0.1, 0.2, 0.3])),
+        ("material", "{kind='phong',diffuse=0.5,specular=0.25,exponent=10}", jvr.PhongBRDF(0.5, 0.25, 10)),
+        ("material", "'blinn-phong'", jvr.BlinnPhongBRDF()),
+        (
+            "material",
+            "{kind='microfacet',base=0.9,metallic=1,roughness=0.25,reflectance_at_normal=[0.1,0.2,0.3]}",
+            jvr.MicrofacetBRDF(0.9, 1, 0.25, [0.1, 0.2, 0.3]),
+        ),
+        ("material", "{kind='phase',albedo=0.5,phase={kind='henyey-greenstein',g=0.4}}", jvr.PhaseBRDF(PHASE, 0.5)),
+        ("radiance_transfer", "{}", jvr.RadianceTransfer()),
+        ("radiance_transfer", "{frozen=false}", jvr.RadianceTransfer()),
+        (
+            "radiance_transfer",
+            "{order=2,rays=8,resolution=1,bleeding='transfer',chromaticity=1,neighbourhood=0.2,exact=true,step=2,growth=1,"
+            "termination=0,surface=0.5,memory=1e6}",
+            jvr.RadianceTransfer(
+                2,
+                8,
+                1,
+                bleeding=jvr.TransferBleeding(),
+                chromaticity=1,
+                neighbourhood=0.2,
+                exact=True,
+                step=2,
+                growth=1,
+                termination=0,
+                surface=0.5,
+                memory=1e6,
+            ),
+        ),
+        ("radiance_transfer", "{bleeding='material'}", jvr.RadianceTransfer(bleeding=jvr.MaterialBleeding())),
+        ("radiance_transfer", "{scattering='marble'}", jvr.RadianceTransfer(scattering=jvr.Dipole.preset("marble"))),
+        (
+            "radiance_transfer",
+            "{scattering={sigma_s_prime=[1,2,3],sigma_a=[0,0.1,0.2],eta=1.5}}",
+            jvr.RadianceTransfer(scattering=jvr.Dipole([1, 2, 3], [0, 0.1, 0.2], 1.5)),
+        ),
     ],
 )
-def test_an_environment_is_a_name_or_a_table(text, wanted):
-    assert same(scene_of(ENVIRONMENT, f"environment={text}").environment, wanted)
+def test_a_part_is_a_name_or_a_table(key, text, wanted):
+    assert same(getattr(scene_of(ENVIRONMENT, f"{key}={text}"), key), wanted)
 
 
 def test_environments_of_a_list_are_summed():
@@ -67,24 +107,6 @@ def test_an_environment_is_turned_about_its_axes_in_their_order():
     turns = f"[{first},{{axis=[0,0,1],degrees=90}}]"
     found = scene_of(ENVIRONMENT, f"environment={{kind='disc',towards=[0,0,1],half_angle=20,rotation={turns}}}").environment
     np.testing.assert_allclose(found.coefficients, jvr.EnvironmentLight.disc([1, 0, 0], 20).coefficients, atol=1e-6)
-
-
-MATERIALS = [
-    ("'lambert'", jvr.LambertBRDF()),
-    ("{kind='lambert',reflectance=[0.1,0.2,0.3]}", jvr.LambertBRDF([0.1, 0.2, 0.3])),
-    ("{kind='phong',diffuse=0.5,specular=0.25,exponent=10}", jvr.PhongBRDF(0.5, 0.25, 10)),
-    ("'blinn-phong'", jvr.BlinnPhongBRDF()),
-    (
-        "{kind='microfacet',base=0.9,metallic=1,roughness=0.25,reflectance_at_normal=[0.1,0.2,0.3]}",
-        jvr.MicrofacetBRDF(0.9, 1, 0.25, [0.1, 0.2, 0.3]),
-    ),
-    ("{kind='phase',albedo=0.5,phase={kind='henyey-greenstein',g=0.4}}", jvr.PhaseBRDF(PHASE, 0.5)),
-]
-
-
-@pytest.mark.parametrize(("text", "wanted"), MATERIALS)
-def test_a_material_is_a_name_or_a_table(text, wanted):
-    assert same(scene_of(ENVIRONMENT, f"material={text}").material, wanted)
 
 
 def test_a_material_with_a_threshold_is_projected_up_to_the_order_of_the_light():
@@ -112,41 +134,6 @@ def test_a_measured_material_is_read_from_a_file(tmp_path):
         np.full(3 * 90 * 90 * 180, 150.0).tofile(file)
     found = scene_of(ENVIRONMENT, f"material={{kind='merl',path='{path}'}}").material
     assert same(found, jvr.MerlBRDF.read(path))
-
-
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("{}", jvr.RadianceTransfer()),
-        ("{frozen=false}", jvr.RadianceTransfer()),
-        (
-            "{order=2,rays=8,resolution=1,bleeding='transfer',chromaticity=1,neighbourhood=0.2,exact=true,step=2,growth=1,"
-            "termination=0,surface=0.5,memory=1e6}",
-            jvr.RadianceTransfer(
-                2,
-                8,
-                1,
-                bleeding=jvr.TransferBleeding(),
-                chromaticity=1,
-                neighbourhood=0.2,
-                exact=True,
-                step=2,
-                growth=1,
-                termination=0,
-                surface=0.5,
-                memory=1e6,
-            ),
-        ),
-        ("{bleeding='material'}", jvr.RadianceTransfer(bleeding=jvr.MaterialBleeding())),
-        ("{scattering='marble'}", jvr.RadianceTransfer(scattering=jvr.Dipole.preset("marble"))),
-        (
-            "{scattering={sigma_s_prime=[1,2,3],sigma_a=[0,0.1,0.2],eta=1.5}}",
-            jvr.RadianceTransfer(scattering=jvr.Dipole([1, 2, 3], [0, 0.1, 0.2], 1.5)),
-        ),
-    ],
-)
-def test_radiance_transfer_is_a_table(text, wanted):
-    assert same(scene_of(ENVIRONMENT, f"radiance_transfer={text}").radiance_transfer, wanted)
 
 
 def test_a_volume_keeps_the_gradients_that_a_material_asks_for():

@@ -84,37 +84,33 @@ TABLE = "{positions=[0.1,0.9],values=[0.2,0.4]}"
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"),
+    ("key", "text", "wanted"),
     [
-        ("'lambert'", jvr.Lambert()),
-        ("'phong'", jvr.Phong()),
-        ("'blinn-phong'", jvr.BlinnPhong()),
+        ("shading", "'lambert'", jvr.Lambert()),
+        ("shading", "'phong'", jvr.Phong()),
+        ("shading", "'blinn-phong'", jvr.BlinnPhong()),
         (
+            "shading",
             "{kind='lambert',ambient=0.2,diffuse=0.3,threshold=0.1,two_sided=false}",
             jvr.Lambert(0.2, 0.3, threshold=0.1, two_sided=False),
         ),
-        (f"{{kind='phong',diffuse={TABLE},shininess=1}}", jvr.Phong(diffuse=BY_VALUE, shininess=1)),
-        (f"{{kind='blinn-phong',specular={TABLE}}}", jvr.BlinnPhong(specular=BY_VALUE)),
+        ("shading", f"{{kind='phong',diffuse={TABLE},shininess=1}}", jvr.Phong(diffuse=BY_VALUE, shininess=1)),
+        ("shading", f"{{kind='blinn-phong',specular={TABLE}}}", jvr.BlinnPhong(specular=BY_VALUE)),
+        ("shadows", "'rays'", jvr.ShadowRays()),
+        ("shadows", "{kind='rays',step=2,termination=0}", jvr.ShadowRays(2, termination=0)),
+        ("shadows", "{kind='volume',resolution=0.5}", jvr.ShadowVolume(0.5)),
+        ("shadows", "'map'", jvr.ShadowMap()),
+        (
+            "shadows",
+            "{kind='map',texels=64,threshold=0.25,softness=2,bias=1}",
+            jvr.ShadowMap(64, threshold=0.25, softness=2, bias=1),
+        ),
+        ("shadows", "{kind='opacity-map',texels=64,layers=8}", jvr.OpacityShadowMap(64, 8)),
+        ("shadows", "{kind='deep-map',texels=64,layers=8,error=0.02}", jvr.DeepShadowMap(64, 8, error=0.02)),
     ],
 )
-def test_shading_is_a_name_or_a_table(text, wanted):
-    assert same(scene_of(LIT, f"shading={text}").shading, wanted)
-
-
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("'rays'", jvr.ShadowRays()),
-        ("{kind='rays',step=2,termination=0}", jvr.ShadowRays(2, termination=0)),
-        ("{kind='volume',resolution=0.5}", jvr.ShadowVolume(0.5)),
-        ("'map'", jvr.ShadowMap()),
-        ("{kind='map',texels=64,threshold=0.25,softness=2,bias=1}", jvr.ShadowMap(64, threshold=0.25, softness=2, bias=1)),
-        ("{kind='opacity-map',texels=64,layers=8}", jvr.OpacityShadowMap(64, 8)),
-        ("{kind='deep-map',texels=64,layers=8,error=0.02}", jvr.DeepShadowMap(64, 8, error=0.02)),
-    ],
-)
-def test_shadows_are_a_name_or_a_table(text, wanted):
-    assert same(scene_of(LIT, f"shadows={text}").shadows, wanted)
+def test_a_part_is_a_name_or_a_table(key, text, wanted):
+    assert same(getattr(scene_of(LIT, f"{key}={text}"), key), wanted)
 
 
 @pytest.mark.parametrize(

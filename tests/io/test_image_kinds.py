@@ -7,7 +7,8 @@ import numpy as np
 import OpenEXR
 import OpenImageIO
 import pytest
-from PIL import Image, PngImagePlugin
+import tifffile
+from PIL import Image, ImageOps, PngImagePlugin
 
 from jvr.io.images import read_image
 from jvr.pictures import ImageError, linear_from_srgb, write_image
@@ -210,3 +211,85 @@ def test_choices_that_a_file_cannot_have(tmp_path, name, keywords, message):
     write_image(tmp_path / name, np.zeros((2, 3, 3)))
     with pytest.raises(ValueError, match=message):
         read_image(tmp_path / name, **keywords)
+
+
+# --- TIFF ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("planar", ["contig", "separate"])
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+@pytest.mark.parametrize("compression", [None, "deflate"])
+def test_codes_of_a_tiff(tmp_path, kind, planar, compression):
+    codes = RNG.integers(0, np.iinfo(kind).max + 1, (6, 5, 3)).astype(kind)
+    stored = np.moveaxis(codes, -1, 0) if planar == "separate" else codes
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", planarconfig=planar, compression=compression)
+    found = read_image(tmp_path / "a.tif", encoding="linear")
+    np.testing.assert_allclose(found, codes / np.iinfo(kind).max, rtol=1e-6)
+    guessed = said(tmp_path / "a.tif", "do not say their encoding")
+    np.testing.assert_allclose(guessed, linear_from_srgb(codes / np.iinfo(kind).max), rtol=1e-6)
+
+
+def test_floating_point_numbers_of_a_tiff_are_radiance(tmp_path):
+    pixels = RNG.normal(1, 3, (6, 5, 3)).astype(np.float32)
+    pixels[0, 0] = np.nan
+    tifffile.imwrite(tmp_path / "a.tiff", pixels, photometric="rgb", compression="lzw", predictor=True)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tiff"), pixels)
+    tifffile.imwrite(tmp_path / "grey.tif", pixels[..., 0].astype(np.float64), photometric="minisblack")
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.tif"), np.stack([pixels[..., 0]] * 3, -1))
+    with pytest.raises(
+        ImageError, match=r"a\.tiff: it holds floating-point numbers, which are linear radiance: leave encoding out"
+    ):
+        read_image(tmp_path / "a.tiff", encoding="srgb")
+
+
+def test_a_tiff_says_what_its_alpha_is(tmp_path):
+    alpha, behind = CODES[..., 3:] / 255, np.array([0.2, 0.4, 0.8])
+    for kind, colours in (("unassalpha", CODES[..., :3] / 255 * alpha), ("assocalpha", CODES[..., :3] / 255)):
+        tifffile.imwrite(tmp_path / "a.tif", CODES, photometric="rgb", extrasamples=[kind])
+        found = read_image(tmp_path / "a.tif", encoding="linear", background=behind)
+        np.testing.assert_allclose(found, colours + (1 - alpha) * behind, atol=1e-6)
+    tifffile.imwrite(tmp_path / "a.tif", CODES, photometric="rgb", extrasamples=["unspecified"])
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif", encoding="linear"), CODES[..., :3] / 255, rtol=1e-6)
+
+
+def test_palettes_and_inverted_greys_of_pillow(tmp_path):
+    palette = Image.fromarray(CODES[..., :3]).quantize(8)
+    palette.save(tmp_path / "palette.tif")
+    wanted = np.asarray(palette.convert("RGB")) / 255
+    np.testing.assert_allclose(read_image(tmp_path / "palette.tif", encoding="linear"), wanted, atol=1e-6)
+    tifffile.imwrite(tmp_path / "white.tif", CODES[..., 0], photometric="miniswhite")
+    np.testing.assert_allclose(read_image(tmp_path / "white.tif", encoding="linear")[..., 0], 1 - CODES[..., 0] / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_tiff_is_upright_as_pillow_turns_it(tmp_path, orientation):
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, CODES[..., :3], photometric="rgb", extratags=[(274, 3, 1, orientation, True)])
+    turned = np.asarray(ImageOps.exif_transpose(Image.open(path)))
+    np.testing.assert_allclose(read_image(path, encoding="linear"), turned / 255, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "keywords", "message"),
+    [
+        (CODES.reshape(4, 6, 5), {}, "it has 4 pages, an image has one: export that alone"),
+        (CODES[..., 0].astype(np.int16), {}, r"it has numbers of 16 bits \(int16\): export it with 8 or 16 bits, or as floating"),
+        (CODES[..., 0] > 99, {}, "it has numbers of 1 bits"),
+        (CODES, {"photometric": "separated"}, "its colours are neither grey, a palette nor red, green and blue"),
+    ],
+)
+def test_what_is_no_picture_of_a_tiff(tmp_path, numbers, keywords, message):
+    tifffile.imwrite(tmp_path / "a.tif", numbers, **{"photometric": "minisblack", **keywords})
+    with pytest.raises(ImageError, match=rf"a\.tif: {message}"):
+        read_image(tmp_path / "a.tif", encoding="linear")
+
+
+def test_a_tiff_whose_tags_contradict_each_other(tmp_path):
+    """With 0 bits for each number, pages come out in another shape than the one that is announced."""
+    path, bits = tmp_path / "a.tif", np.array([8, 8, 8], "<u2").tobytes()
+    tifffile.imwrite(path, CODES[..., :3], photometric="rgb", byteorder="<", compression="deflate")
+    content = path.read_bytes()
+    assert content.count(bits) == 1
+    path.write_bytes(content.replace(bits, bytes(6)))
+    with pytest.raises(ImageError, match=r"a\.tif: its pages are .* where it says \(6, 5, 3\): export it again"):
+        read_image(path, encoding="linear")

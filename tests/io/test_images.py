@@ -242,7 +242,7 @@ def test_wrong_names(tmp_path, pixels):
     write_image(tmp_path / "a.png", pixels)
     (tmp_path / "a.png").rename(tmp_path / "a.exr")
     fails("looks like a PNG image; give the file its right extension", read_image, tmp_path / "a.exr")
-    fails("cannot read .tga; images are .exr, .hdr, .png or .jpg", read_image, tmp_path / "a.tga")
+    fails("cannot read .tga; images are .exr, .hdr, .png, .jpg or .tif", read_image, tmp_path / "a.tga")
     (tmp_path / "b.png").mkdir()
     fails("this is a folder", read_image, tmp_path / "b.png")
     fails("cannot write .jpg; use .exr", write_image, tmp_path / "c.jpg", pixels)

@@ -20,7 +20,7 @@ from jvr.io.config.schema.parts import table_of
 from jvr.io.kinds import KINDS, PARTS
 from jvr.io.reference import markdown, public_parameters
 from jvr.model.exact import Exact
-from jvr.model.light import AbstractDeltaLight, AbstractLight, LightSample
+from jvr.model.light import AbstractDeltaLight, LightSample
 from jvr.model.parameters import GREY_OR_RGB, alternatives, assign, choice, declared, parameter, parts_of, range_at
 from jvr.model.phase import AbstractPhase, ScatteringAngle, components
 from jvr.model.ranges import ANY, RADIANCE, Interval
@@ -69,13 +69,9 @@ class LinearPhase(AbstractPhase):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _registered():
-    """Known to files while these tests run, and not to others."""
+def _registered(_registry):
     jvr.register("lamp", LampLight)
     jvr.register("linear", LinearPhase)
-    yield
-    for family, kind, name in ((AbstractLight, "lamp", "LampLight"), (AbstractPhase, "linear", "LinearPhase")):
-        del KINDS[family][kind], PARTS[name]
 
 
 CONFIG = """

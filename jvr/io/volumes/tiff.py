@@ -7,7 +7,7 @@ import math
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -32,6 +32,8 @@ COLOURS = ("red", "green", "blue")
 # Of the tag ResolutionUnit, in mm; 1 is none.
 RESOLUTION_UNITS = {2: 25.4, 3: 10.0}
 
+Result = TypeVar("Result")
+
 
 @contextlib.contextmanager
 def _recorded():
@@ -54,6 +56,14 @@ def read_tiff(path: Path, given: Given, decoder: Callable[[Path, dict[str, Any],
     `given.array` is the number or name of one of several images; `given.axes` names the axes in place of what the file says.
     `decoder` is what decodes LZW: a `Decoder`, for many files.
     """
+    return opened(path, lambda file, messages: _read(path, file, given, decoder, messages))
+
+
+def opened(path: Path, read: Callable[[Any, list[str]], Result]) -> Result:
+    """What `read` makes of a file of tifffile and of the messages that come of it.
+
+    **Raises** `VolumeError` for a file that is no TIFF, damaged or cut short.
+    """
     import tifffile
 
     start = first_bytes(path)
@@ -62,7 +72,7 @@ def read_tiff(path: Path, given: Given, decoder: Callable[[Path, dict[str, Any],
     with _recorded() as messages:
         try:
             with tifffile.TiffFile(path) as file:
-                stored = _read(path, file, given, decoder, messages)
+                found = read(file, messages)
         except VolumeError:
             raise
         except Exception as error:
@@ -71,7 +81,7 @@ def read_tiff(path: Path, given: Given, decoder: Callable[[Path, dict[str, Any],
                 raise VolumeError(path, problem) from None
             raise VolumeError(path, f"damaged, cut short or not supported: {one_line(error)}") from None
     _refuse_damage(path, messages)
-    return stored
+    return found
 
 
 def _refuse_damage(path: Path, messages: list[str]) -> None:
@@ -85,12 +95,11 @@ def _read(path: Path, file: Any, given: Given, decoder: Any, messages: list[str]
     # OME-XML is checked before tifffile parses it.
     images = ome_images(path, file.ome_metadata or "") if file.is_ome else []
     number, series = _series(path, file, images, given, messages)
-    _check_pages(path, series)
+    check_pages(path, series)
     image = images[number] if len(images) == len(file.series) else None
     names = _axes(path, series, given)
     found = chosen(path, series.shape, names, given, _channels(series, names, image))
-    packed = series.keyframe.compression == LZW
-    values = found.of(_apart(path, number, series, decoder) if packed else series.asarray())
+    values = found.of(numbers_of(path, number, series, decoder))
     orientation = int(series.keyframe.tags.valueof(274, 1) or 1)
     if orientation != 1:
         problem = f"its tag Orientation is {orientation}: row 0 is not the top, or column 0 not the left"
@@ -102,8 +111,15 @@ def _read(path: Path, file: Any, given: Given, decoder: Any, messages: list[str]
     return Stored(values, affine_of(_spacing(path, file, series, image, found, given)), missing=_missing(series))
 
 
-def _apart(path: Path, number: int, series: Any, decoder: Any) -> np.ndarray:
-    """All pages, from a process of its own: the decoder of LZW, native code, crashes on damaged ones."""
+def numbers_of(path: Path, number: int, series: Any, decoder: Any = decoded) -> np.ndarray:
+    """All pages of a series that has been checked, those of LZW from a process of its own: its decoder, native code, crashes on damaged
+    ones."""
+    if series.keyframe.compression != LZW:
+        values = series.asarray()
+        # Where tags contradict each other, it is what it is.
+        if values.shape != tuple(series.shape):
+            raise VolumeError(path, f"its pages are {values.shape} where it says {tuple(series.shape)}: export it again")
+        return values
     if importlib.util.find_spec("imagecodecs") is None:
         raise VolumeError(path, "its compression (LZW) needs the package imagecodecs: pip install imagecodecs")
     count = math.prod(series.shape) * series.dtype.itemsize
@@ -131,7 +147,7 @@ def _series(path: Path, file: Any, images: list[OmeImage], given: Given, message
     raise VolumeError(path, f"it holds no single image '{given.array}'; array= may be {shown}")
 
 
-def _check_pages(path: Path, series: Any) -> None:
+def check_pages(path: Path, series: Any) -> None:
     """Refuses, before anything is decoded, what is cut short, in other files that are missing, or larger decoded than it says."""
     page = series.keyframe
     most = COMPRESSIONS.get(int(page.compression), 0)

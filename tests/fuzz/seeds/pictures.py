@@ -10,7 +10,7 @@ import numpy as np
 from jvr.io.environment import read_environment
 from jvr.io.images import ImageError, read_image
 from jvr.pictures import write_image
-from seeds.seed import SHAPE, Seed
+from seeds.seed import SHAPE, SLOW, Seed
 
 ROWS = 8 * -(-SHAPE[0] // 8) * -(-SHAPE[2] // 16)
 PIXELS = np.random.default_rng(0).random((ROWS, 2 * ROWS, 3)).astype(np.float32)
@@ -36,9 +36,28 @@ def pictures(folder: Path) -> dict[str, Seed]:
     names |= {"d.png": "png, 16 bits, grey with alpha"}
     names |= {"a.jpg": "jpg", "b.jpg": "jpg, progressive", "a.hdr": "hdr"}
     seeds = {names.get(name, name): _picture(name, content) for name, content in contents.items()}
+    seeds |= _tiffs(folder, codes)
     for ending in ("exr", "hdr"):
         name = f"a.{ending}"
         seeds[f"map, {ending}"] = Seed({name: contents[name]}, name, read_environment, (ImageError,))
+    return seeds
+
+
+def _tiffs(folder: Path, codes: np.ndarray) -> dict[str, Seed]:
+    import tifffile
+    from PIL import Image
+
+    path, seeds = folder / "a.tif", {}
+    for name, pixels, keywords in (
+        ("colours", codes, {"compression": "deflate", "planarconfig": "contig"}),
+        ("alpha", codes[..., [0, 1, 2, 0]], {"extrasamples": ["unassalpha"]}),
+        ("floats", PIXELS, {"compression": "lzw", "predictor": True}),
+    ):
+        tifffile.imwrite(path, pixels, photometric="rgb", **keywords)
+        share = SLOW if keywords.get("compression") == "lzw" else 1
+        seeds[f"picture, tif, {name}"] = Seed({"a.tif": path.read_bytes()}, "a.tif", read_image, (ImageError,), share)
+    Image.fromarray(codes).quantize(16).save(path)
+    seeds["picture, tif, palette"] = Seed({"a.tif": path.read_bytes()}, "a.tif", read_image, (ImageError,))
     return seeds
 
 
