@@ -124,9 +124,11 @@ def vtk_case(scene: scenes.Scene, kind: str, shaded: bool, size: int) -> Case:
         renderer = getattr(vtk_mappers, kind)(one)
         renderer.prepare(STEP)
         if shaded:
-            look = renderer.look
-            look.ShadeOn()
-            look.SetAmbient(AMBIENT), look.SetDiffuse(DIFFUSE), look.SetSpecular(SPECULAR), look.SetSpecularPower(EXPONENT)
+            renderer.look.ShadeOn()
+            renderer.look.SetAmbient(AMBIENT)
+            renderer.look.SetDiffuse(DIFFUSE)
+            renderer.look.SetSpecular(SPECULAR)
+            renderer.look.SetSpecularPower(EXPONENT)
         renderer.draw()
         images.append(np.asarray(renderer.picture(), np.float32))
     truth, settings = ours.scene_of(scene), jvr.Settings(STEP, termination=TERMINATION)
@@ -134,8 +136,10 @@ def vtk_case(scene: scenes.Scene, kind: str, shaded: bool, size: int) -> Case:
     if not shaded:
         return Case(truth, _cameras(seen), images, settings, table, eqx.tree_at(table, truth, _flat(scene)))
     light = {"lights": (jvr.HeadLight(1.0), jvr.AmbientLight(1.0))}
-    look = jvr.Phong(AMBIENT, DIFFUSE, SPECULAR, EXPONENT)
-    truth = dataclasses.replace(truth, shading=look, **light)
+    # The GPU mapper mirrors, the ray caster has half vectors; both take central differences.
+    look = jvr.Phong if kind == "GpuRenderer" else jvr.BlinnPhong
+    shading = look(AMBIENT, DIFFUSE, SPECULAR, EXPONENT)
+    truth = dataclasses.replace(truth, shading=shading, normals=jvr.CentralDifferences(), **light)
     both = lambda s: (*table(s), s.shading.ambient, s.shading.specular, s.shading.shininess)
     return Case(
         truth, _cameras(seen), images, settings, both, eqx.tree_at(both, truth, (*_flat(scene), *map(jnp.asarray, GUESS)))
@@ -223,7 +227,7 @@ def figure(report: dict[str, Any], path: str) -> None:
         for axes, picture, title in zip(row, (theirs, known, fitted, 0.5 + 20 * (fitted - theirs)), titles, strict=True):
             axes.imshow(np.clip(picture, 0, 1))
             axes.set_title(title, fontsize=8)
-            axes.set_xticks([]), axes.set_yticks([])
+            axes.set(xticks=[], yticks=[])
         row[0].set_ylabel(name, fontsize=7)
     drawing.savefig(path, dpi=110)
 

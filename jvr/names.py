@@ -46,6 +46,7 @@ NAMES = {
         "SquaredError",
     ),
     "jvr.fitting.minimisers": ("LBFGSB",),
+    "jvr.fitting.next_view": ("Candidate", "next_view"),
     "jvr.fitting.residuals": ("residuals",),
     "jvr.fitting.bijectors": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
     "jvr.integrators.refinement": ("Refinement",),

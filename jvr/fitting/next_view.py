@@ -21,12 +21,12 @@ from jvr.rendering.settings import Settings
 class Candidate(NamedTuple):
     """What one more view would bring.
 
-    - `index`: of the camera among the candidates; `camera`.
+    - `number`: of the camera among the candidates, from 0; `camera`.
     - `gain`: information about the unknowns together, in bits: `log2(det(F + F_view) / det(F)) / 2` (D-optimality).
     - `errors`: standard errors of the unknowns afterwards by name, as plain noise would have them.
     """
 
-    index: int
+    number: int
     camera: AbstractCamera
     gain: float
     errors: dict[str, np.ndarray]
@@ -41,9 +41,10 @@ def next_view(result: FitResult, candidates: Sequence[AbstractCamera], settings:
     width of a range, else a value's own size (`jvr.fitting.unknowns.Unknowns.plausible`). Gains of several views do not add up: take the
     first, fit again, ask again.
 
-    **Arguments:** `result`: of `jvr.fit`, of a table or other few unknowns; `candidates`: cameras of any kind and size; `settings`:
-    those of the fit.
-    **Raises** `ValueError` for a fit that has no information matrix (voxels, DSSIM's included), and without candidates.
+    **Arguments:** `result`: of `jvr.fit`, of a table or other few unknowns; `candidates`: cameras of any kind and size;
+    `settings`: those of the fit.
+    **Raises** `ValueError` for a fit that has no information matrix (voxels), without candidates, and for a candidate that does
+    not see the volume.
     """
     if not result.information.size:
         raise ValueError(
@@ -57,7 +58,7 @@ def next_view(result: FitResult, candidates: Sequence[AbstractCamera], settings:
     before = size[:, None] * result.information * size + np.eye(size.size)
     found = []
     for i, camera in enumerate(candidates):
-        after = before + size[:, None] * _information(problem, values, camera) * size / result.stats.residual_variance
+        after = before + size[:, None] * _information(problem, values, i, camera) * size / result.stats.residual_variance
         gain = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]) / np.log(2)
         errors = size * np.sqrt(np.diag(np.linalg.inv(after)))
         parts = np.split(errors, np.cumsum([v.size for v in problem.unknowns.values(problem.model)])[:-1])
@@ -82,9 +83,15 @@ def _problem(result: FitResult, settings: Settings) -> tuple[Problem, jax.Array]
     return problem, jnp.concatenate([jnp.ravel(value) for value in chosen.values(model)])
 
 
-def _information(problem: Problem, values: jax.Array, camera: AbstractCamera) -> Float[np.ndarray, "unknowns unknowns"]:
+def _information(
+    problem: Problem, values: jax.Array, index: int, camera: AbstractCamera
+) -> Float[np.ndarray, "unknowns unknowns"]:
     """`sum J^T J` over the pixels of a view."""
     nothing: list[Any] = [np.zeros((camera.height, camera.width, 3), values.dtype)]
-    rays, around = observe(problem.model.scene, [camera], nothing, None, problem.settings), light_tangents(problem, values)
+    try:
+        rays = observe(problem.model.scene, [camera], nothing, None, problem.settings)
+    except ValueError as error:
+        raise ValueError(f"candidate {index}: {error}") from error
+    around = light_tangents(problem, values)
     tiles = (normal_equations(problem, values, rays, i, 1, around) for i in range(rays.tile_count()))
     return np.sum([np.asarray(tile.matrix, np.float64) for tile in tiles], axis=0)
