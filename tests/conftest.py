@@ -11,7 +11,8 @@ os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "false")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 gc.set_threshold(200_000, 10, 10)
 # Most of the time goes into compiling programs that run for a moment: a quarter of it without what makes them fast.
-CHEAP = "--xla_backend_optimization_level=0"
+# A third of what remains goes into loops that the compiler copies for each kernel that they are fused into, unless it does so at the end.
+CHEAP = "--xla_backend_optimization_level=0 --xla_backend_extra_options=xla_cpu_flatten_after_fusion=1"
 if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
     # Later compilers do not know these flags, and a flag that is not known ends the process.
     CHEAP += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
