@@ -71,11 +71,11 @@ class FitStats(NamedTuple):
     residual_variance: float
     rank: int
     condition: float
-    structured: bool
-    design_effect: float
-    smoothed: tuple[tuple[str, int], ...]
     worst: tuple[tuple[str, float], ...]
     held_out: tuple[tuple[float, float], ...]
+    structured: bool = False
+    design_effect: float = float("nan")
+    smoothed: tuple[tuple[str, int], ...] = ()
 
 
 class FitResult(NamedTuple):
@@ -86,7 +86,7 @@ class FitResult(NamedTuple):
     - `standard_errors`: of every fitted value, in the structure of `unknowns(scene)`; infinite where the images do not determine it,
       NaN for more unknowns than a Gauss-Newton matrix is made for (voxels).
     - `unknowns`: the paths of the fitted arrays in the scene, such as `transfer.rgb`, in the order of `standard_errors`.
-    - `information`: the inverse of the covariance of all fitted values, one after the other, as plain noise would have it, `(n, n)`; empty
+    - `information`: the inverse of the covariance of all fitted values, one after the other, as plain noise would have it, `(n, n)`; `None`
       where there are too many. `jvr.next_view` reads it.
     - `outcome`: how the iteration ended.
     - `exposure`: the fitted factor between rendered and target radiance, 1 where it was not asked for.
@@ -97,10 +97,10 @@ class FitResult(NamedTuple):
     history: tuple[Iteration, ...]
     standard_errors: Any
     unknowns: tuple[str, ...]
-    information: np.ndarray
     outcome: Outcome
     exposure: float
     stats: FitStats
+    information: np.ndarray | None = None
 
     @property
     def errors_by_name(self) -> dict[str, np.ndarray]:

@@ -74,7 +74,7 @@ class Identifiability(NamedTuple):
 
     standard_errors: Float[np.ndarray, "unknowns"]
     variance: float
-    information: Float[np.ndarray, "unknowns unknowns"]
+    information: Float[np.ndarray, "unknowns unknowns"] | None
     rank: int
     least_determined: Float[np.ndarray, "unknowns"]
     condition: float
@@ -85,7 +85,7 @@ class Identifiability(NamedTuple):
 def undetermined(unknowns: int) -> Identifiability:
     """What stands for the identifiability of unknowns that are too many for their Gauss-Newton matrix: nothing but NaN."""
     nothing = np.full(unknowns, np.nan)
-    return Identifiability(nothing, float("nan"), np.zeros((0, 0)), 0, nothing, float("nan"), float("nan"), False)
+    return Identifiability(nothing, float("nan"), None, 0, nothing, float("nan"), float("nan"), False)
 
 
 def identifiability(

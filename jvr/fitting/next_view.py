@@ -46,13 +46,13 @@ def next_view(result: FitResult, candidates: Sequence[AbstractCamera], settings:
     **Raises** `ValueError` for a fit that has no information matrix (voxels), without candidates, and for a candidate that does
     not see the volume.
     """
-    if not result.information.size:
+    if result.information is None:
         raise ValueError(
             "the fit has too many unknowns for an information matrix: next_view ranks views for tables and other few unknowns"
         )
     if not candidates:
         raise ValueError("there are no candidates: give cameras that could be taken, such as jvr.orbit(...)")
-    problem, values = _problem(result, settings)
+    problem, values = _problem(result, len(result.information), settings)
     size = problem.unknowns.plausible(problem.model, np.asarray(values, np.float64))
     # In units of what is plausible, so that the small matrix is well scaled.
     before = size[:, None] * result.information * size + np.eye(size.size)
@@ -70,12 +70,12 @@ def next_view(result: FitResult, candidates: Sequence[AbstractCamera], settings:
     return tuple(sorted(found, key=lambda candidate: -candidate.gain))
 
 
-def _problem(result: FitResult, settings: Settings) -> tuple[Problem, jax.Array]:
-    """The fit again, at its end, and its values."""
+def _problem(result: FitResult, count: int, settings: Settings) -> tuple[Problem, jax.Array]:
+    """The fit of `count` unknowns again, at its end, and its values."""
     select = lambda m: tuple(leaves_by_name(m.scene)[name] for name in result.unknowns)
     model = ExposedModel(result.scene, None)
     fitted = sum(np.size(leaf) for leaf in select(model))
-    if len(result.information) > fitted:
+    if count > fitted:
         model, without = ExposedModel(result.scene, jnp.asarray(result.exposure, jnp.result_type(float))), select
         select = lambda m: (*without(m), m.exposure)
     chosen = choose_unknowns(model, select)

@@ -268,6 +268,18 @@ def make_page(tmp_path, result, **keywords):
     return text, Page(text)
 
 
+def test_page_says_what_was_smoothed_and_that_the_model_does_not_explain_the_images(tmp_path, table):
+    result = make_result(table, ERRORS)
+    plain, _ = make_page(tmp_path, result)
+    assert "wrong in the same way" not in plain
+    assert "continued smoothly" not in plain
+    stats = result.stats._replace(structured=True, design_effect=4.09, smoothed=(("transfer.rgb", 18),))
+    told, _ = make_page(tmp_path, result._replace(stats=stats))
+    assert "vary 4.09 times as much" in told
+    assert "18 of transfer.rgb" in told
+    assert "neighbouring residuals are alike" in result._replace(stats=stats)._repr_html_()
+
+
 WORST = (("transfer.rgb[2, 1]", 0.7), ("transfer.rgb[2, 0]", 0.5), ("transfer.sigma_t[3]", -0.5))
 
 
