@@ -41,6 +41,8 @@ from jvr.types import Outcome
 KEEP_LIMIT = 2**30
 # The Jacobian of other unknowns than a table's entries takes one march for each.
 MOST_FORWARD = 512
+# Radiance of 80 dB below white: kept samples are rounded to about as much.
+INVISIBLE = 1e-4
 
 
 class Iteration(NamedTuple):
@@ -76,6 +78,11 @@ class FitStats(NamedTuple):
     structured: bool = False
     design_effect: float = float("nan")
     smoothed: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def is_misfit(self) -> bool:
+        """Whether residuals are structured and large enough to be seen: a root mean square above `INVISIBLE`."""
+        return self.structured and self.residual_variance > INVISIBLE**2
 
 
 class FitResult(NamedTuple):
@@ -117,7 +124,7 @@ class FitResult(NamedTuple):
             middle = f"standard error {np.median(known):.2g} (median), " if known.size else ""
             lines.append(f"{name}: {middle}{errors.size - known.size} of {errors.size} not determined by the images")
         lines += [f"{name}: {count} values continued from their neighbours" for name, count in self.stats.smoothed]
-        lines += ["neighbouring residuals are alike: the model does not explain the images"] if self.stats.structured else []
+        lines += ["neighbouring residuals are alike: the model does not explain the images"] if self.stats.is_misfit else []
         return f"<div>{'<br>'.join(map(escape, lines))}{self.scene.transfer._repr_html_()}</div>"
 
 

@@ -109,11 +109,11 @@ def _smoothed(stats: "FitStats") -> str:
 
 
 def _misfit(stats: "FitStats") -> str:
-    if not stats.structured:
+    if not stats.is_misfit:
         return ""
     return (
         "<p>Neighbouring pixels are wrong in the same way: sums of residuals over squares of pixels vary "
         f"{stats.design_effect:.3g} times as much as those of noise would. This model does not explain the images, whatever its unknowns "
-        "(another renderer's sampling, a camera's blur, light or shading that it lacks, a background); standard errors allow for "
+        "(another renderer's sampling, a camera's blur, light or shading that it lacks, too few entries); standard errors allow for "
         "that, and suppose that unknowns have absorbed an error of brightness and of contrast as large as the residuals.</p>"
     )
