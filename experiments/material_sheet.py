@@ -59,8 +59,7 @@ def pictures(size: int) -> tuple[dict[str, np.ndarray], dict[tuple[str, str], np
     scene = dataclasses.replace(scene, lights=(), shading=None, shadows=None)
     lights = {name: upright(jvr.EnvironmentLight.from_image(read_environment(DATA / "env" / name), ORDER)) for name in PROBES}
     found = {}
-    transfer = jvr.RadianceTransfer(ORDER, 128, 0.5, exact=True)
-    projected = None
+    transfer, projected = jvr.RadianceTransfer(ORDER, 128, 0.5, exact=True), None
     for title, material in MATERIALS.items():
         lit = dataclasses.replace(
             scene,
@@ -68,8 +67,8 @@ def pictures(size: int) -> tuple[dict[str, np.ndarray], dict[tuple[str, str], np
             material=jvr.HarmonicMaterial.project(material, ORDER, threshold=20.0),
             radiance_transfer=transfer,
         )
-        # What reaches a point does not depend on its material.
-        if projected is None:
+        # What reaches a point does not depend on its material, but on whether that has surfaces.
+        if projected is None or projected.stale(lit):
             projected = jvr.precompute(lit).radiance_transfer
         lit = dataclasses.replace(lit, radiance_transfer=projected)
         for name, light in lights.items():
