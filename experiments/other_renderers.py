@@ -39,6 +39,7 @@ STEP = 0.5
 TERMINATION = 1 / 255
 # VTK's coefficients of reflection, and the exponent of its highlights.
 AMBIENT, DIFFUSE, SPECULAR, EXPONENT = 0.3, 0.6, 0.3, 10.0
+# Where a fit starts with those that it does not know: ambient, specular, exponent.
 GUESS = 0.5, 0.1, 5.0
 # Of Mitsuba, a pixel.
 SAMPLES = 256

@@ -12,8 +12,6 @@ ROUNDING = 256
 # Above this fraction of its square in the null space a value is not determined.
 NULL_FRACTION = 1e-4
 TINY = 1e-30
-
-
 # Residuals are structured where their sums over blocks vary by so many standard deviations more than those of independent ones ...
 SIGNIFICANT = 5
 # ... of at least so many blocks.

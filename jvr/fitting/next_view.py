@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jvr.fitting.fit import FitResult
+from jvr.fitting.identifiability import TINY
 from jvr.fitting.losses import SquaredError
 from jvr.fitting.normal_equations import light_tangents, normal_equations
 from jvr.fitting.observations import is_mostly_empty, observe
@@ -56,9 +57,11 @@ def next_view(result: FitResult, candidates: Sequence[AbstractCamera], settings:
     size = problem.unknowns.plausible(problem.model, np.asarray(values, np.float64))
     # In units of what is plausible, so that the small matrix is well scaled.
     before = size[:, None] * result.information * size + np.eye(size.size)
+    # As in the information of a fit whose residuals are all zero.
+    variance = max(result.stats.residual_variance, TINY)
     found = []
     for i, camera in enumerate(candidates):
-        after = before + size[:, None] * _information(problem, values, i, camera) * size / result.stats.residual_variance
+        after = before + size[:, None] * _information(problem, values, i, camera) * size / variance
         gain = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]) / np.log(2)
         errors = size * np.sqrt(np.diag(np.linalg.inv(after)))
         parts = np.split(errors, np.cumsum([v.size for v in problem.unknowns.values(problem.model)])[:-1])

@@ -26,7 +26,7 @@ from jvr.rendering.medium import Prepared
 from jvr.types import Triple
 
 
-class Channel(eqx.Module):
+class _Channel(eqx.Module):
     """One colour channel of a tile: for each ray its block of pixels, its colour, `r`, `w` and `w rho(r)` of `Normal`, and its row for the
     unknowns in `columns`."""
 
@@ -136,10 +136,12 @@ def _channels(
     observations: Observations,
     place: tuple[Int[Array, ""], Int[Array, ""]],
     around: LightTangents | None,
-) -> list[Channel]:
+) -> list[_Channel]:
     shared, stored = problem.apart()
 
-    def share(shared: tuple[Problem, Array, Any, LightTangents | None], rays: tuple[Array | None, Observations]) -> list[Channel]:
+    def share(
+        shared: tuple[Problem, Array, Any, LightTangents | None], rays: tuple[Array | None, Observations]
+    ) -> list[_Channel]:
         problem, values, place, around = shared
         stored, observations = rays
         return _share_of_channels(problem.reassembled(stored), values, observations.tile(*place), around)
@@ -149,7 +151,7 @@ def _channels(
 
 def _share_of_channels(
     problem: Problem, values: Float[Array, "unknowns"], tile: Observations, around: LightTangents | None
-) -> list[Channel]:
+) -> list[_Channel]:
     colours, blocks = _jacobian(problem, values, tile, around)
     channels = []
     for c, colour in enumerate(colours):
@@ -158,12 +160,12 @@ def _share_of_channels(
         columns = tuple(np.concatenate([columns for _, columns in blocks[c]]).tolist())
         losses = tile.weight * problem.loss.value(r)
         weight = tile.weight * problem.loss.weight(r)
-        channels.append(Channel(tile.block, colour, r, weight, losses, rows, columns))
+        channels.append(_Channel(tile.block, colour, r, weight, losses, rows, columns))
     return channels
 
 
 @eqx.filter_jit
-def _sums(channels: list[Channel], n: int) -> Normal:
+def _sums(channels: list[_Channel], n: int) -> Normal:
     total = Normal(jnp.zeros(()), jnp.zeros(()), jnp.zeros((n, n)), jnp.zeros(n))
     for channel in channels:
         fields = channel.residual, channel.weight, channel.loss, channel.rows
@@ -179,7 +181,7 @@ def _sums(channels: list[Channel], n: int) -> Normal:
 
 
 @eqx.filter_jit
-def _scores(channels: list[Channel], n: int, blocks: int) -> Scores:
+def _scores(channels: list[_Channel], n: int, blocks: int) -> Scores:
     score, by_channel = jnp.zeros((blocks, n)), []
     for channel in channels:
         fields = channel.colour, channel.residual, channel.weight, channel.rows

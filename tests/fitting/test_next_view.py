@@ -95,3 +95,10 @@ def test_what_cannot_be_ranked_is_named(known):
         jvr.next_view(known, [])
     with pytest.raises(ValueError, match="too many unknowns"):
         jvr.next_view(known._replace(information=None), CANDIDATES)
+
+
+def test_residuals_of_zero_leave_gains_finite(known):
+    exact = known._replace(stats=known.stats._replace(residual_variance=0.0))
+    (best,) = jvr.next_view(exact, CANDIDATES[:1], SETTINGS)
+    assert np.isfinite(best.gain)
+    assert best.gain > 0
