@@ -17,13 +17,14 @@ import optimistix as optx
 from jvr.fitting import checkpoint as checkpoints
 from jvr.fitting.continuation import continued
 from jvr.fitting.evaluator import Evaluator
+from jvr.fitting.groups import Lights, groups_of, lights_of, lit
 from jvr.fitting.identifiability import Identifiability, undetermined
 from jvr.fitting.kinds import march_unknowns
 from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.minimisers import OptimistixSolver
 from jvr.fitting.objective import check_derivatives
-from jvr.fitting.observations import Observations, check_settings, is_mostly_empty, keep_samples, observe
+from jvr.fitting.observations import check_settings, is_mostly_empty
 from jvr.fitting.problem import Problem
 from jvr.fitting.reach import known_background, say_what_is_out_of_reach
 from jvr.fitting.solvers import AbstractSolver
@@ -31,14 +32,11 @@ from jvr.fitting.targets import Targets, targets_of
 from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns, selected
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.model.transfer import AbstractTable
 from jvr.rendering.measure import psnr, similarity
 from jvr.rendering.render import render
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
 
-# Kept samples are given up where they would take more than this many bytes.
-KEEP_LIMIT = 2**30
 # The Jacobian of other unknowns than a table's entries takes one march for each.
 MOST_FORWARD = 512
 # Radiance of 80 dB below white: kept samples are rounded to about as much.
@@ -98,6 +96,7 @@ class FitResult(NamedTuple):
     - `outcome`: how the iteration ended.
     - `exposure`: the fitted factor between rendered and target radiance, 1 where it was not asked for.
     - `stats`: `FitStats`.
+    - `cameras`, `settings`: those of the fit, by which `jvr.next_view` goes.
     """
 
     scene: Scene
@@ -108,6 +107,8 @@ class FitResult(NamedTuple):
     exposure: float
     stats: FitStats
     information: np.ndarray | None = None
+    cameras: tuple[AbstractCamera, ...] = ()
+    settings: Settings = Settings()
 
     @property
     def errors_by_name(self) -> dict[str, np.ndarray]:
@@ -125,6 +126,7 @@ class FitResult(NamedTuple):
             lines.append(f"{name}: {middle}{errors.size - known.size} of {errors.size} not determined by the images")
         lines += [f"{name}: {count} values continued from their neighbours" for name, count in self.stats.smoothed]
         lines += ["neighbouring residuals are alike: the model does not explain the images"] if self.stats.is_misfit else []
+        lines += _one_more_view(self)
         return f"<div>{'<br>'.join(map(escape, lines))}{self.scene.transfer._repr_html_()}</div>"
 
 
@@ -140,8 +142,9 @@ def fit(
     priors: Sequence[AbstractPrior] = (),
     transforms: Any = None,
     weights: Sequence[Any] | None = None,
+    lights: Any = None,
     exposure: bool = False,
-    held_out: tuple[Sequence[AbstractCamera], Any] | None = None,
+    held_out: tuple[Any, ...] | None = None,
     keep_samples: bool | int = True,
     smooth_undetermined: bool = True,
     max_steps: int = 100,
@@ -162,8 +165,9 @@ def fit(
     - `loss`: `jvr.SquaredError()`, `jvr.Huber()`, `jvr.AbsoluteError()` or, for solvers that use gradients alone, `jvr.DSSIM()`.
     - `priors`: penalties added to the mean loss; `transforms`: one for each unknown array, see `jvr.fitting.unknowns`.
     - `weights`: one `(height, width)` array for each image, not negative, such as masks.
+    - `lights`: of each view, a light or a sequence of them, in place of the scene's; they are known. All else is shared.
     - `exposure`: also fit the factor between rendered and target radiance.
-    - `held_out`: `(cameras, images)` that are only compared with at the end.
+    - `held_out`: `(cameras, images)` or `(cameras, images, lights)` that are only compared with at the end.
     - `keep_samples`: keep the resampled values along all rays (2 bytes each) while the volume is not unknown, so that no step touches
       the volume again; a number is the most bytes to take (`True`: 1 GiB), beyond which every step resamples.
     - `smooth_undetermined`: continue entries of a table that the images do not determine smoothly from those that they do, in place of what
@@ -189,20 +193,23 @@ def fit(
     scene = scene.current()
     model = ExposedModel(scene, jnp.ones(()) if exposure else None)
     chosen = _choose(model, unknowns, transforms, solver)
-    model = _without_stale(model, chosen)
+    model = without_stale(model, chosen)
     scene, chosen = model.scene, _choose(model, unknowns, transforms, solver)
     behind = known_background(model, chosen)
     targets, weights = given = targets_of(cameras, images, weights, behind)
-    held = None if held_out is None else (held_out[0], targets_of(*held_out, None, behind, "held-out image"))
+    lights = lights_of(lights, cameras)
+    held = None if held_out is None else _held_out(held_out, behind)
     start = chosen.model_from_unconstrained(model, chosen.unconstrained_from_model(model))
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
     forwards = _check(problem, solver, given)
     say_what_is_out_of_reach(problem, given)
 
-    problem, observations = _keep(problem, observe(scene, cameras, targets, weights, settings), keep_samples)
-    check_derivatives(problem, observations, forwards=forwards)
-    evaluator = Evaluator(problem, observations, cameras, targets)
-    mark = checkpoints.fingerprint(problem, (cameras, targets, weights), solver) if checkpoint else {}
+    choose = lambda model: _choose(model, unknowns, transforms, solver)
+    groups = groups_of(problem, choose, (cameras, given), lights, keep_samples)
+    problem = groups[0].problem
+    check_derivatives(problem, groups[0].observations, forwards=forwards)
+    evaluator = Evaluator(groups, cameras, targets)
+    mark = checkpoints.fingerprint(problem, (cameras, targets, weights, lights), solver) if checkpoint else {}
     # The observations hold them.
     del targets, given
     state, history = solver.init(evaluator.functions, chosen.unconstrained_from_model(model)), []
@@ -234,7 +241,7 @@ def fit(
     selected, structure = jax.tree.flatten(unknowns(scene))
     stats = FitStats(
         seconds=time.perf_counter() - began,
-        kept_bytes=0 if problem.samples is None else problem.samples.bytes,
+        kept_bytes=sum(group.problem.samples.bytes for group in groups if group.problem.samples is not None),
         residual_variance=known.variance,
         rank=known.rank,
         condition=known.condition,
@@ -253,7 +260,17 @@ def fit(
         outcome=outcome or Outcome.STEP_LIMIT,
         exposure=1.0 if found.exposure is None else float(found.exposure),
         stats=stats,
+        cameras=tuple(cameras),
+        settings=settings,
     )
+
+
+def _one_more_view(result: FitResult) -> list[str]:
+    """What the best of default candidates would bring, of a fit with few unknowns."""
+    from jvr.fitting.next_view import best_of, in_words
+
+    best = best_of(result)
+    return [] if best is None else [in_words(best, result.unknowns)]
 
 
 def _as_solver(solver: Any) -> AbstractSolver:
@@ -274,7 +291,7 @@ def _choose(model: ExposedModel, unknowns: Callable[[Scene], Any], transforms: A
     return choose_unknowns(model, select, transforms, solver.bounds)
 
 
-def _without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
+def without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
     """The model without what was computed of the unknowns' start and would stay so: what its volume keeps, and a radiance transfer, which
     is taken as it is."""
     transfer = lambda m: m.scene.radiance_transfer
@@ -314,24 +331,6 @@ def _check(problem: Problem, solver: AbstractSolver, given: Targets) -> bool:
     return is_least_squares
 
 
-def _keep(problem: Problem, observations: Observations, keep: bool | int) -> tuple[Problem, Observations]:
-    """Samples along the rays, where the volume and its clipping are known and memory allows."""
-    among = lambda select: problem.unknowns.among(problem.model, select)
-    moving = among(lambda m: (m.scene.volume, m.scene.clipping))
-    # What is kept is the scalar alone.
-    only_scalars = problem.integrator.marches and not problem.model.scene.needs_gradient
-    if keep is False or moving or not only_scalars or isinstance(problem.loss, DSSIM):
-        return problem, observations
-    limit = KEEP_LIMIT if keep is True else keep
-    # Colours and extinctions of a table leave its ends where they are; whatever else it has may move them.
-    entries = lambda transfer: (transfer.rgb, transfer.sigma_t) if isinstance(transfer, AbstractTable) else ()
-    clamped = among(lambda m: m.scene.transfer) == among(lambda m: entries(m.scene.transfer))
-    kept = keep_samples(problem.model.scene, observations, problem.settings, limit, clamped=clamped)
-    if kept is None:
-        return problem, observations
-    return problem.with_samples(kept[0]), kept[1]
-
-
 def _iteration(evaluator: Evaluator, solver: AbstractSolver, state: Any, step: int, seconds: float) -> Iteration:
     unconstrained, loss = solver.iterate(state)
     level = int(getattr(state, "level", -1))
@@ -357,12 +356,20 @@ def _counted(chosen: Unknowns, model: ExposedModel, which: np.ndarray) -> tuple[
     return tuple((name, int(part.sum())) for name, part in zip(chosen.names, parts, strict=True) if part.any())
 
 
+def _held_out(held_out: tuple[Any, ...], behind: Any) -> tuple[Sequence[AbstractCamera], Targets, Lights | None]:
+    """Cameras, targets and lights of views that take no part."""
+    cameras, images, *rest = held_out
+    lights = lights_of(rest[0] if rest else None, cameras, "held-out view")
+    return cameras, targets_of(cameras, images, None, behind, "held-out image"), lights
+
+
 def _compare(
-    found: ExposedModel, settings: Settings, cameras: Sequence[AbstractCamera], targets: Targets
+    found: ExposedModel, settings: Settings, cameras: Sequence[AbstractCamera], targets: Targets, lights: Lights | None
 ) -> tuple[tuple[float, float], ...]:
     """PSNR and SSIM of views that took no part in the fit."""
     exposure = 1.0 if found.exposure is None else float(found.exposure)
-    pictures = [exposure * np.asarray(render(found.scene, camera, settings).rgb) for camera in cameras]
+    scenes = [found.scene if lights is None else lit(found.scene, lights[i], i) for i in range(len(cameras))]
+    pictures = [exposure * np.asarray(render(*seen, settings).rgb) for seen in zip(scenes, cameras, strict=True)]
     return tuple((psnr(*pair), similarity(*pair)) for pair in zip(targets.marked(), pictures, strict=True))
 
 

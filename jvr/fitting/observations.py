@@ -249,7 +249,7 @@ def _check_views(lengths: Sequence[np.ndarray], scene: Scene) -> None:
     if blind:
         named = ", ".join(map(str, blind))
         warnings.warn(
-            f"cameras that see nothing of the volume, so that their images say nothing of it: {named}; {where}", stacklevel=4
+            f"cameras that see nothing of the volume, so that their images say nothing of it: {named}; {where}", stacklevel=5
         )
 
 
