@@ -19,9 +19,7 @@ def pose_step(scene: jvr.Scene, cameras: Any, images: Any, settings: jvr.Setting
     """Seconds of the normal equations of all six unknowns of every view, which is what a step of Levenberg-Marquardt takes, over those of
     plain pictures of the views, in turns."""
     model = ExposedModel(scene.current(), None, Views.at_rest(tuple(cameras)))
-    chosen = choose_unknowns(
-        model, lambda m: [c.world_from_camera for c in m.views.shown], bounds=jvr.LevenbergMarquardt().bounds
-    )
+    chosen = choose_unknowns(model, lambda m: m.views and m.views.motions, bounds=jvr.LevenbergMarquardt().bounds)
     problem = Problem(model, chosen, settings, SquaredError(), (), None, is_mostly_empty(scene, settings))
     observations = observe(scene, cameras, [np.asarray(image) for image in images], None, settings, unknown=range(len(cameras)))
     evaluator, at = Evaluator(problem, observations, cameras, None), chosen.unconstrained_from_model(model)

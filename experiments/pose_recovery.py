@@ -26,6 +26,7 @@ import jvr
 from benchmarks.peers import shapes
 from benchmarks.poses import pose_step
 from experiments import protocols
+from jvr.model.camera import AbstractCamera
 
 STARTS = 100
 # Degrees, millimetres.
@@ -82,7 +83,7 @@ def disturbed(camera: jvr.PerspectiveCamera, center: np.ndarray, rng: np.random.
     return jvr.PerspectiveCamera(pose, camera.fov_y, camera.width, camera.height)
 
 
-def apart(one: jvr.PerspectiveCamera, other: jvr.PerspectiveCamera, center: np.ndarray) -> tuple[float, float]:
+def apart(one: AbstractCamera, other: AbstractCamera, center: np.ndarray) -> tuple[float, float]:
     """Degrees and millimetres between two poses: the rotation, and the way of the volume's centre as the camera sees it."""
     a, b = _pose(one), _pose(other)
     turn = Rotation.from_matrix(a[:3, :3] @ b[:3, :3].T).magnitude()
@@ -90,7 +91,7 @@ def apart(one: jvr.PerspectiveCamera, other: jvr.PerspectiveCamera, center: np.n
     return float(np.degrees(turn)), float(np.linalg.norm(places[0] - places[1]))
 
 
-def _pose(camera: jvr.PerspectiveCamera) -> np.ndarray:
+def _pose(camera: AbstractCamera) -> np.ndarray:
     matrix = np.asarray(camera.world_from_camera, np.float64)
     return matrix + np.asarray(camera.remainder.beside(camera.world_from_camera), np.float64)
 

@@ -340,7 +340,8 @@ def _rows_of_views(
         gathered, of_rays = ray_jacobian(options, through, rays, prepared.dt, final)
         along = jax.vmap(lambda t: jax.jvp(move, (still,), (t,))[1])(basis)
         colours = ()
-        found = [sum(jax.tree.leaves(jax.tree.map(lambda g, x: g * x, of, along))).T for of in of_rays]
+        chained = lambda of: jax.tree.reduce(jnp.add, jax.tree.map(jnp.multiply, of, along))
+        found = [chained(of).T for of in of_rays]
     columns = tuple(map(tuple, of_views.columns.tolist()))
     known = jnp.asarray(of_views.columns == sum(v.size for v in problem.unknowns.values(problem.model)))[view]
     return gathered, [_OfViews(view, jnp.where(known, 0, rows), columns) for rows in found], colours

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jvr.march.adjoint import replay
-from jvr.march.march import Marched, MarchOptions, integrate
+from jvr.march.march import Marched, MarchOptions, ReplayRecord, integrate
 from jvr.march.medium import Medium
 from jvr.march.steps import Rays
 from jvr.types import Scalar, Triple
@@ -28,7 +28,7 @@ def ray_jacobian(
     ones, zeros = jnp.ones_like(rays.length), jnp.zeros_like(rays.length)
     pulled = [pull(tuple(ones if i == c else zeros for i in range(3))) for c in range(len(found))]
     if gathered.radiance:
-        return gathered, _replayed(medium, rays, dt, record, [Marched(*one, (), None) for one in pulled])
+        return gathered, _replayed(medium, rays, dt, record, [Marched(L, tau, (), None) for L, tau in pulled])
     # Where nothing glows, channels are alike but for a factor.
     n = len(gathered.tau)
     alone = [Marched((), tuple(ones if i == c else zeros for i in range(n)), (), None) for c in range(n)]
@@ -37,7 +37,7 @@ def ray_jacobian(
     return gathered, tuple(scaled(c) for c in range(3))
 
 
-def _replayed(medium: Medium, rays: Rays, dt: Scalar, record, cotangents: list[Marched]) -> tuple[Rays, ...]:
+def _replayed(medium: Medium, rays: Rays, dt: Scalar, record: ReplayRecord, cotangents: list[Marched]) -> tuple[Rays, ...]:
     wanted = (jax.tree.map(lambda _: None, medium), rays, None)
     fixed = (medium, jax.tree.map(lambda _: None, rays), dt)
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *cotangents)

@@ -77,12 +77,14 @@ MOTIONS = [np.zeros(6), [1e-7, 0, 0, 1, 2, 3], [3, -4, 5, -10, 20, 5], [57.2, 1,
 MOTIONS += [[0, 179.9999, 0, 4, 5, 6], [180, 0, 0, -1, 2, 0], [100, -150, 200, 7, 0, 1]]
 
 
+_with_slopes = jax.jit(lambda motion: (*exponential(motion), *jax.jacfwd(exponential)(motion)))
+
+
 @pytest.mark.parametrize("motion", MOTIONS, ids=str)
 def test_motions_are_matrix_exponentials(motion):
     """In both precisions, at zero and about pi, value and derivative; the differences of SciPy's are good to 1e-8."""
     with jax.enable_x64(True):
-        turn, shift = map(np.asarray, jax.jit(exponential)(jnp.asarray(motion, float)))
-        of_turn, of_shift = map(np.asarray, jax.jit(jax.jacfwd(exponential))(jnp.asarray(motion, float)))
+        turn, shift, of_turn, of_shift = map(np.asarray, _with_slopes(jnp.asarray(motion, float)))
     wanted = expm(motion)
     np.testing.assert_allclose(turn + np.eye(3), wanted[:3, :3], rtol=0, atol=1e-14)
     np.testing.assert_allclose(shift, wanted[:3, 3], rtol=1e-12, atol=1e-13)
@@ -91,10 +93,11 @@ def test_motions_are_matrix_exponentials(motion):
         slope = (expm(np.asarray(motion) + step) - expm(np.asarray(motion) - step)) / (2 * h)
         np.testing.assert_allclose(of_turn[:, :, i], slope[:3, :3], atol=1e-8)
         np.testing.assert_allclose(of_shift[:, i], slope[:3, 3], atol=1e-7)
-    single, _ = exponential(jnp.asarray(motion, jnp.float32))
+    single = _with_slopes(jnp.asarray(motion, jnp.float32))[0]
     np.testing.assert_allclose(single + np.eye(3), wanted[:3, :3], atol=5e-6)
 
 
+@pytest.mark.slow
 def test_a_camera_that_does_not_move_is_the_same_to_the_last_digit():
     far = jvr.PerspectiveCamera.look_at((1e5 / 3, 2e5 / 7, 3.3), CENTER, (0, 0, 1), 0.02, 8, 8)
     still = moved_about(far, jnp.zeros(6), VOLUME.center)
@@ -140,6 +143,7 @@ def pictures():
     ]
 
 
+@pytest.mark.slow
 def test_rows_of_cameras_are_those_of_differences_in_double_precision(pictures):
     """`J^T J` of two views: both poses, a focal length that they share, one principal point and the background: rays enter a medium that is
     not empty at its border, and the pictures have two sizes."""
@@ -168,6 +172,7 @@ def test_rows_of_cameras_are_those_of_differences_in_double_precision(pictures):
     np.testing.assert_allclose(found / scale / scale[:, None], wanted / scale / scale[:, None], atol=2e-4)
 
 
+@pytest.mark.slow
 def test_gradients_go_through_cameras():
     """What solvers of gradients see: the value's derivative in a motion is that of the normal equations."""
     result = fit(disturbed(2.0, 0.5), solver=optx.BFGS(rtol=1e-4, atol=1e-6), max_steps=25)
@@ -192,6 +197,7 @@ def test_poses_come_back():
     assert "3 poses: standard error" in result._repr_html_()
 
 
+@pytest.mark.slow
 def test_poses_come_back_together_with_colours():
     start = eqx.tree_at(lambda s: s.transfer.rgb, TRUTH, jnp.full_like(TRUTH.transfer.rgb, 0.5))
     unknowns = lambda s, cameras: (s.transfer.rgb, cameras[0].world_from_camera, cameras[2].world_from_camera)
@@ -202,6 +208,7 @@ def test_poses_come_back_together_with_colours():
     np.testing.assert_allclose(result.scene.transfer.rgb, TRUTH.transfer.rgb, atol=0.01)
 
 
+@pytest.mark.slow
 def test_one_angle_of_view_for_all():
     wrong = [dataclasses.replace(camera, fov_y=33.0) for camera in CAMERAS]
     result = fit(wrong, unknowns=lambda s, cameras: jvr.shared([c.fov_y for c in cameras]))
@@ -210,6 +217,7 @@ def test_one_angle_of_view_for_all():
     assert np.shape(result.standard_errors) == ()
 
 
+@pytest.mark.slow
 def test_a_rig_moves_as_one():
     motion = [2.0, -1.5, 2.5, 0.5, -0.3, 0.4]
     start = [with_pose(camera, moved(pose_of(camera), motion)) for camera in CAMERAS]
@@ -219,6 +227,7 @@ def test_a_rig_moves_as_one():
     assert np.shape(result.standard_errors) == (6,)
 
 
+@pytest.mark.slow
 def test_a_fit_goes_on_from_its_checkpoint(tmp_path):
     start, file = disturbed(4.0, 1.0), tmp_path / "fit.npz"
     whole = fit(start, max_steps=4)
@@ -229,6 +238,7 @@ def test_a_fit_goes_on_from_its_checkpoint(tmp_path):
         fit(CAMERAS, max_steps=4, checkpoint=file, resume=True)
 
 
+@pytest.mark.slow
 def test_what_names_no_camera_is_the_fit_that_it_was():
     """The cameras in the function's reach change nothing, not even a digit."""
     one, other = (
@@ -239,6 +249,7 @@ def test_what_names_no_camera_is_the_fit_that_it_was():
     assert one.cameras == other.cameras
 
 
+@pytest.mark.slow
 def test_the_next_view_adds_to_what_unknown_poses_leave():
     """The information about a scene is less where poses are found as well, so that a view adds more."""
     known = fit(CAMERAS[:1], noisy(1)[:1], both, max_steps=0)
