@@ -93,15 +93,15 @@ def config_from(data: dict[str, Any], name: str, folder: Path = Path(), override
 
 
 def _with_cameras(data: dict[str, Any], name: str, folder: Path, keys: tuple[str, ...]) -> dict[str, Any]:
-    """Tables with those of the file that `camera` names in its place, as a fit writes one."""
+    """Tables with those of the file that `camera` names in its place, as a fit writes one; other words are kinds of cameras."""
     given = data.get("camera")
-    if not isinstance(given, str):
+    if not isinstance(given, str) or not given.endswith(".toml"):
         return data
     where = _where(name, keys, "camera")
     folders = [Path(), folder] if where == "--set" else [folder]
     found = next((place / given for place in folders if (place / given).is_file()), None)
     if found is None:
-        raise ConfigError(where, "camera", f"'{given}' does not exist; it is a table, or a file of tables [[camera]]")
+        raise ConfigError(where, "camera", f"'{given}' does not exist; a file of tables [[camera]] is meant, as a fit writes one")
     _, tables = read_toml(found)
     if set(tables) != {"camera"}:
         raise ConfigError(str(found), "", "a file of cameras has tables [[camera]] and nothing else")
