@@ -91,7 +91,7 @@ def _saved(folder: Path) -> Saved:
         raise BadInput(f"{folder}: was written by an older jvr, without {KNOWLEDGE}; run the fit again, jvr fit --force")
     saved = read_knowledge(folder / KNOWLEDGE)
     if saved.information is None:
-        raise BadInput(f"{folder}: the fit has too many unknowns to rank views for, such as voxels; tables have few enough")
+        raise BadInput(f"{folder}: {saved.refused}")
     return saved
 
 

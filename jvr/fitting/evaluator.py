@@ -82,6 +82,10 @@ class Evaluator:
         self.sums = tuple(_sums(groups, every) for every in self.levels)
         self.functions = self._functions(cameras, images)
 
+    def settle(self, problem: Problem) -> None:
+        """Takes the problem at the end of its iteration in the place of that of the first group."""
+        self.problem, self.groups = problem, (Group(problem, self.groups[0].observations), *self.groups[1:])
+
     def expand(self, level: int, unconstrained: Float[Array, "unknowns"]) -> tuple[float, Normal]:
         """The objective at `unconstrained`, over the rays of a level, and the normal equations in the unknowns' own values."""
         values = self.problem.unknowns.values_from_unconstrained(jnp.asarray(unconstrained), self.problem.model)
@@ -224,11 +228,12 @@ def _levels(groups: tuple[Group, ...]) -> tuple[int, ...]:
     """All rays, after a subset that still over-determines the unknowns where that is much smaller."""
     problem, observations = groups[0].problem, [group.observations for group in groups]
     unknowns = sum(v.size for v in problem.unknowns.values(problem.model))
-    every = min(
-        MOST_THINNING,
-        3 * sum(o.size for o in observations) // max(LEAST_RESIDUALS * unknowns, sum(o.chunk for o in observations)),
-    )
-    return (1,) if every < 2 else (every, 1)
+    tiles = lambda every: sum(o.tile_count(every) for o in observations)
+    rays, together = sum(o.size for o in observations), sum(o.chunk for o in observations)
+    every = min(MOST_THINNING, 3 * rays // max(LEAST_RESIDUALS * unknowns, together))
+    # Where a subset fills as many tiles it takes as long.
+    saves = lambda: (problem.model.views is None and len(groups) == 1) or tiles(every) < tiles(1)
+    return (every, 1) if every >= 2 and saves() else (1,)
 
 
 _mean_squares = eqx.filter_jit(value)

@@ -1,7 +1,7 @@
 """Groups of views: those that are lit alike are one problem, and a fit sums over all of them."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -36,14 +36,17 @@ def groups_of(
     views: tuple[Sequence[AbstractCamera], Targets],
     lights: Lights | None,
     keep: bool | int,
+    unknown: Collection[int],
 ) -> tuple[Group, ...]:
-    """The groups of a fit, one without `lights`. `choose`: finds the unknowns in a model; `keep`: as in `jvr.fit`.
+    """The groups of a fit, one without `lights`. `choose`: finds the unknowns in a model; `keep`: as in `jvr.fit`; `unknown`: cameras that
+    the fit finds.
 
     **Raises** `ValueError` for lights that the scene cannot have, or that are unknown, and where no ray meets the volume.
     """
     cameras, (targets, weights) = views
     if lights is None:
-        return (_kept(problem, observe(problem.model.scene, cameras, targets, weights, problem.settings), keep),)
+        seen = observe(problem.model.scene, cameras, targets, weights, problem.settings, unknown=unknown)
+        return (_kept(problem, seen, keep),)
     _check(problem, lights)
     groups, begin, alike = [], 0, _alike(lights)
     # All groups together take as much memory as one would.
@@ -96,6 +99,8 @@ def lit(scene: Scene, lights: Sequence[AbstractLight], view: int) -> Scene:
 def _check(problem: Problem, lights: Lights) -> None:
     """Refuses what lights of single views do not go together with."""
     scene = problem.model.scene
+    if problem.model.views is not None:
+        raise ValueError("cameras are unknown, and lights of single views know where these are: leave one of the two out")
     if problem.unknowns.among(problem.model, lambda m: m.scene.lights):
         raise ValueError("lights of single views are known and take the place of scene.lights: leave these out of the unknowns")
     if isinstance(problem.loss, DSSIM):
@@ -122,7 +127,7 @@ def _alike(lights: Lights) -> list[list[int]]:
 def _kept(problem: Problem, observations: Observations, keep: bool | int) -> Group:
     """With samples along the rays, where the volume and its clipping are known and memory allows."""
     among = lambda select: problem.unknowns.among(problem.model, select)
-    moving = among(lambda m: (m.scene.volume, m.scene.clipping))
+    moving = problem.model.views is not None or among(lambda m: (m.scene.volume, m.scene.clipping))
     # What is kept is the scalar alone.
     only_scalars = problem.integrator.marches and not problem.model.scene.needs_gradient
     if keep is False or moving or not only_scalars or isinstance(problem.loss, DSSIM):

@@ -10,12 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jvr.fitting.bijectors import Identity
-from jvr.fitting.fit import FitResult, without_stale
+from jvr.fitting.fit import without_stale
 from jvr.fitting.identifiability import TINY
 from jvr.fitting.losses import SquaredError
 from jvr.fitting.normal_equations import light_tangents, normal_equations
 from jvr.fitting.observations import is_mostly_empty, observe
 from jvr.fitting.problem import Problem
+from jvr.fitting.result import FitResult
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns, leaves_by_name
 from jvr.model.camera import AbstractCamera, fibonacci_sphere
 from jvr.model.exact import Remainder, in_double
@@ -56,12 +57,36 @@ class Knowledge(NamedTuple):
 
     @classmethod
     def of(cls, result: FitResult) -> "Knowledge":
-        """**Raises** `ValueError` for a fit of voxels."""
+        """**Raises** `ValueError` for a fit of voxels, or of cameras alone."""
         if result.information is None:
             raise ValueError(
                 "the fit has too many unknowns for an information matrix: next_view ranks views for tables and other few unknowns"
             )
+        result = _about_the_scene(result)
+        assert result.information is not None
         return cls(result.scene, result.unknowns, result.information, result.stats.residual_variance, result.exposure)
+
+
+def _about_the_scene(result: FitResult) -> FitResult:
+    """The result without the cameras that were found: the information about the rest is the Schur complement, with a camera's values
+    uncertain by one of their unit where the fit leaves them open."""
+    assert result.information is not None
+    is_camera = ["cameras" in name for name in result.unknowns]
+    if all(is_camera):
+        raise ValueError(
+            "the fit has found cameras alone, of which another view says nothing: give it unknowns of the scene as well"
+        )
+    if not any(is_camera):
+        return result
+    sizes = [errors.size for errors in result.errors_by_name.values()]
+    camera = np.repeat(is_camera, sizes)
+    # The exposure comes last.
+    camera = np.append(camera, np.zeros(len(result.information) - camera.size, bool))
+    whole = result.information
+    own, crossed = whole[np.ix_(camera, camera)], whole[np.ix_(camera, ~camera)]
+    rest = whole[np.ix_(~camera, ~camera)] - crossed.T @ np.linalg.solve(own + np.eye(len(own)), crossed)
+    names = tuple(name for name, found in zip(result.unknowns, is_camera, strict=True) if not found)
+    return result._replace(information=rest, unknowns=names)
 
 
 def next_view(
@@ -82,8 +107,8 @@ def next_view(
     **Arguments:** `result`: of `jvr.fit`, of a table or other few unknowns; `candidates`: cameras of any kind and size, by default
     `around` the volume; they are lit by the scene's own lights; `settings`: by default those of the fit; `pixels`: how many of each
     candidate are looked at, spread evenly, each for its neighbours as well.
-    **Raises** `ValueError` for a fit that has no information matrix (voxels), without candidates, and for a candidate that does
-    not see the volume.
+    **Raises** `ValueError` for a fit that has no information matrix (voxels) or has found cameras alone, without candidates, and for a
+    candidate that does not see the volume.
     """
     known = Knowledge.of(result)
     candidates = around(result.scene, result.cameras) if candidates is None else candidates
@@ -202,7 +227,8 @@ def _information(
 
 
 def best_of(result: FitResult) -> Candidate | None:
-    """The best of default candidates, `None` for a fit of voxels and where these do not see the volume, as through a clipping box."""
+    """The best of default candidates, `None` for a fit of voxels or cameras, and where these do not see the volume, as through a clipping
+    box."""
     if result.information is None or not result.cameras:
         return None
     try:
@@ -211,9 +237,9 @@ def best_of(result: FitResult) -> Candidate | None:
         return None
 
 
-def in_words(best: Candidate, names: Sequence[str]) -> str:
+def in_words(best: Candidate) -> str:
     """What a candidate would bring, in a line."""
     x, y, z = np.asarray(best.camera.world_from_camera)[:3, 3]
-    medians = (f"{name} {np.median(best.before[name]):.2g} to {np.median(best.errors[name]):.2g}" for name in names)
+    medians = (f"{name} {np.median(before):.2g} to {np.median(best.errors[name]):.2g}" for name, before in best.before.items())
     place = f"({x:.4g}, {y:.4g}, {z:.4g})"
     return f"one more view, from {place}, would bring {best.gain:.1f} bits: median standard error of {', of '.join(medians)}"

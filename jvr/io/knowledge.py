@@ -22,35 +22,42 @@ class KnowledgeError(ValueError):
 
 
 class Saved(NamedTuple):
-    """`config`: as the fit had it; `values`: of each unknown array by its path in the scene; `information`: `None` for a fit of voxels;
-    `variance` of the residuals; `exposure`."""
+    """`config`: as the fit had it; `values`: of each unknown array by its path in the scene; `information` about them, `None` where
+    `refused` says why there is none; `variance` of the residuals; `exposure`."""
 
     config: Config
     values: dict[str, np.ndarray]
     information: Float[np.ndarray, "unknowns unknowns"] | None
     variance: float
     exposure: float
+    refused: str | None
 
 
 def write_knowledge(path: Path, config: Config, result: "FitResult") -> None:
-    """Writes what a fit of a configuration has found; of voxels, that it has no information matrix. The file is replaced at once or not at
-    all."""
+    """Writes what a fit of a configuration has found; of voxels or of cameras alone, that there is no information about it. The file is
+    replaced at once or not at all."""
+    from jvr.fitting.next_view import Knowledge
     from jvr.fitting.unknowns import leaves_by_name
 
-    information = result.information
+    known, refused = None, None
+    try:
+        known = Knowledge.of(result)
+    except ValueError as error:
+        refused = str(error)
     meta = {
         "version": VERSION,
         "config": {"data": config.data, "name": config.name, "folder": str(config.folder.absolute())},
         "overridden": config.overridden,
-        "unknowns": None if information is None else result.unknowns,
+        "unknowns": () if known is None else known.unknowns,
+        "refused": refused,
         "variance": result.stats.residual_variance,
         "exposure": result.exposure,
     }
     arrays = {"meta": np.array(json.dumps(meta, default=str))}
-    if information is not None:
+    if known is not None:
         leaves = leaves_by_name(result.scene)
-        arrays |= {f"value{i}": np.asarray(leaves[name]) for i, name in enumerate(result.unknowns)}
-        arrays["information"] = information[np.triu_indices(len(information))]
+        arrays |= {f"value{i}": np.asarray(leaves[name]) for i, name in enumerate(known.unknowns)}
+        arrays["information"] = known.information[np.triu_indices(len(known.information))]
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -73,9 +80,8 @@ def read_knowledge(path: Path) -> Saved:
     given: dict[str, Any] = meta["config"]
     config = config_from(given["data"], given["name"], Path(given["folder"]))
     config = dataclasses.replace(config, overridden=tuple(meta["overridden"]))
-    names = meta["unknowns"] or []
-    values = {name: arrays[f"value{i}"] for i, name in enumerate(names)}
-    return Saved(config, values, _square(arrays.get("information")), meta["variance"], meta["exposure"])
+    values = {name: arrays[f"value{i}"] for i, name in enumerate(meta["unknowns"])}
+    return Saved(config, values, _square(arrays.get("information")), meta["variance"], meta["exposure"], meta["refused"])
 
 
 def _square(upper: np.ndarray | None) -> np.ndarray | None:

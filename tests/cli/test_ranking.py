@@ -144,7 +144,8 @@ def test_what_cannot_be_ranked_is_one_line(line, hint, tmp_path, monkeypatch, ca
     for name in ("older", "newer", "damaged", "voxels"):
         (tmp_path / name / "result.json").touch()
     config = {"data": tomllib.loads(FIT), "name": "fit.toml", "folder": str(tmp_path)}
-    meta = {"version": 1, "config": config, "overridden": [], "unknowns": None, "variance": 1.0, "exposure": 1.0}
+    meta = {"version": 1, "config": config, "overridden": [], "unknowns": [], "variance": 1.0, "exposure": 1.0}
+    meta["refused"] = "the fit has too many unknowns"
     for name, version in (("newer", 1000), ("voxels", 1)):
         np.savez(tmp_path / name / "knowledge.npz", meta=np.array(json.dumps(meta | {"version": version})))
     (tmp_path / "damaged" / "knowledge.npz").write_bytes(b"PK\x03\x04")

@@ -334,7 +334,7 @@ def test_a_fit_of_light_starts_where_it_is_told_to():
         ("fit.initial={scatering={albedo=0}}", "fit.initial.scatering.albedo: unknown key; did you mean 'scattering'?"),
         ("fit.initial={scattering={albedo=2}}", "fit.initial: scattering.albedo: must be in [0, 1]"),
         ("fit.initial={lights={3={intensity=2}}}", "fit.initial: lights.3.intensity: '3' must be an index from 0 to 0"),
-        ("fit.initial={volume={packed=true}}", "fit.initial.volume.packed: unknown key; known: lights"),
+        ("fit.initial={volume={packed=true}}", "fit.initial.volume.packed: unknown key; known: camera, lights"),
     ],
 )
 def test_mistakes_about_unknown_light_are_named(change, hint):

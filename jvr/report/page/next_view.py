@@ -18,7 +18,7 @@ def one_more_view(result: "FitResult") -> str:
         return ""
     x, y, z = np.asarray(best.camera.world_from_camera, float)[:3, 3]
     rows = []
-    for name in result.unknowns:
+    for name in best.before:
         before, after = np.ravel(best.before[name]), np.ravel(best.errors[name])
         most = np.unravel_index(int(np.argmin(after / before)), np.shape(best.before[name]))
         entry = f"[{', '.join(map(str, most))}]" if most else ""
