@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from jvr.fitting.bijectors import Ordered as Ordered
     from jvr.fitting.bijectors import Sigmoid as Sigmoid
     from jvr.fitting.bijectors import Softplus as Softplus
-    from jvr.fitting.fit import FitResult as FitResult
     from jvr.fitting.fit import fit as fit
     from jvr.fitting.initialise import colours_given_extinction as colours_given_extinction
     from jvr.fitting.initialise import flat_transfer as flat_transfer
@@ -42,6 +41,8 @@ if TYPE_CHECKING:
     from jvr.fitting.next_view import Candidate as Candidate
     from jvr.fitting.next_view import next_view as next_view
     from jvr.fitting.residuals import residuals as residuals
+    from jvr.fitting.result import FitResult as FitResult
+    from jvr.fitting.unknowns import shared as shared
     from jvr.integrators.refinement import Refinement as Refinement
     from jvr.integrators.slices.oracle import BrickRange as BrickRange
     from jvr.integrators.slices.oracle import Finest as Finest

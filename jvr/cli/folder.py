@@ -10,8 +10,9 @@ from jvr.atomic import remove_parts
 from jvr.cli.inputs import BadInput
 
 CHECKPOINT, PAGE, RESULT, TRANSFER = "checkpoint.npz", "report.html", "result.json", "transfer.toml"
+CAMERAS = "cameras.toml"
 PICTURES = r"(target|fitted|difference)_(held_out_)?\d{2,}\.(exr|png)"
-WRITTEN = re.compile("|".join([PICTURES, *map(re.escape, (CHECKPOINT, PAGE, RESULT, TRANSFER))]))
+WRITTEN = re.compile("|".join([PICTURES, *map(re.escape, (CHECKPOINT, PAGE, RESULT, TRANSFER, CAMERAS))]))
 
 
 def results_in(folder: Path) -> list[Path]:
