@@ -160,7 +160,7 @@ def test_convergence_runs_beside_scipy(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_pictures_of_other_renderers_are_explained(monkeypatch, tmp_path):
-    """The quick phantom in 24^2 pixels: jvr draws the known function as VTK does, and a fit explains a view that was kept aside as well."""
+    """The quick phantom in 24 x 24 pixels: jvr draws the known function as VTK does, and a fit explains a view that was kept aside as well."""
     pytest.importorskip("vtk")
     numbers = tmp_path / "numbers.json"
     monkeypatch.setattr(sys, "argv", ["experiment", "--quick", "--json", str(numbers), "--only", "GPU"])
@@ -168,7 +168,9 @@ def test_pictures_of_other_renderers_are_explained(monkeypatch, tmp_path):
     found = json.loads(numbers.read_text())
     assert set(found) == {"VTK GPU, phantom", "VTK GPU, phantom, shaded"}
     plain, shaded = found.values()
-    assert plain["known_psnr"] > QUICK_KNOWN
-    assert plain["held_out_psnr"] > QUICK_PLAIN
-    assert shaded["held_out_psnr"] > QUICK_SHADED
+    # 20 voxels a side leave surfaces of a pixel: 40 dB, where scans in larger pictures come to more than 50.
+    assert plain["known_psnr"] > 39
+    assert plain["held_out_psnr"] > plain["known_psnr"] - 1.5
+    assert shaded["held_out_psnr"] > 35
+    assert plain["opacity_rmse"] < 0.06
     assert all(row["outcome"] == "CONVERGED" for row in found.values())
