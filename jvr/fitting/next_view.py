@@ -17,6 +17,7 @@ from jvr.fitting.normal_equations import light_tangents, normal_equations
 from jvr.fitting.observations import is_mostly_empty, observe
 from jvr.fitting.problem import Problem
 from jvr.fitting.result import FitResult
+from jvr.fitting.targets import check_cameras
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns, leaves_by_name
 from jvr.model.camera import AbstractCamera, fibonacci_sphere
 from jvr.model.exact import Remainder, in_double
@@ -136,6 +137,9 @@ def ranked(
     known: Knowledge, candidates: Sequence[AbstractCamera], settings: Settings, pixels: int = PIXELS, most: int | None = None
 ) -> tuple[Candidate, ...]:
     """`next_view` of what a fit knows, the `most` first."""
+    if isinstance(candidates, AbstractCamera):
+        raise TypeError("candidates must be a sequence: put a single one in brackets, as [camera]")
+    check_cameras(candidates, "candidates")
     if not len(candidates):
         raise ValueError("there are no candidates: give cameras that could be taken, such as jvr.orbit(...)")
     if pixels < 1:
