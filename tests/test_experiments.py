@@ -160,7 +160,7 @@ def test_convergence_runs_beside_scipy(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_pictures_of_other_renderers_are_explained(monkeypatch, tmp_path):
-    """The quick phantom in 24 x 24 pixels: jvr draws the known function as VTK does, and a fit explains a view that was kept aside as well."""
+    """The quick phantom: jvr draws the known function as VTK does, and a fit explains a view that was kept aside as well."""
     pytest.importorskip("vtk")
     numbers = tmp_path / "numbers.json"
     monkeypatch.setattr(sys, "argv", ["experiment", "--quick", "--json", str(numbers), "--only", "GPU"])

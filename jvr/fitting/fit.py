@@ -294,7 +294,7 @@ def _counted(chosen: Unknowns, model: ExposedModel, which: np.ndarray) -> tuple[
 
 def _held_out(held_out: tuple[Any, ...], behind: Any) -> tuple[Sequence[AbstractCamera], Targets, Lights | None]:
     """Cameras, targets and lights of views that take no part."""
-    if not isinstance(held_out, tuple) or len(held_out) not in (2, 3):
+    if not isinstance(held_out, tuple | list) or len(held_out) not in (2, 3):
         raise TypeError(
             "held_out must be (cameras, images) or (cameras, images, lights), each a sequence with an entry for each view"
         )
