@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from jvr.fitting.bijectors import Softplus as Softplus
     from jvr.fitting.fit import FitResult as FitResult
     from jvr.fitting.fit import fit as fit
+    from jvr.fitting.grids import fit_on_grids as fit_on_grids
     from jvr.fitting.initialise import colours_given_extinction as colours_given_extinction
     from jvr.fitting.initialise import flat_transfer as flat_transfer
     from jvr.fitting.least_squares import Dogleg as Dogleg
@@ -42,6 +43,10 @@ if TYPE_CHECKING:
     from jvr.fitting.next_view import Candidate as Candidate
     from jvr.fitting.next_view import next_view as next_view
     from jvr.fitting.residuals import residuals as residuals
+    from jvr.fitting.voxel_errors import VoxelErrors as VoxelErrors
+    from jvr.fitting.voxel_errors import voxel_errors as voxel_errors
+    from jvr.fitting.voxel_priors import Tikhonov as Tikhonov
+    from jvr.fitting.voxel_priors import TotalVariation as TotalVariation
     from jvr.integrators.refinement import Refinement as Refinement
     from jvr.integrators.slices.oracle import BrickRange as BrickRange
     from jvr.integrators.slices.oracle import Finest as Finest

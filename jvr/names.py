@@ -34,6 +34,7 @@ NAMES = {
     "jvr.effects.shadow_volume": ("OpacityShadowMap", "ShadowVolume"),
     "jvr.execution.devices": ("use_all_cores",),
     "jvr.fitting.fit": ("FitResult", "fit"),
+    "jvr.fitting.grids": ("fit_on_grids",),
     "jvr.fitting.initialise": ("colours_given_extinction", "flat_transfer"),
     "jvr.fitting.least_squares": ("Dogleg", "GaussNewton", "LevenbergMarquardt"),
     "jvr.fitting.losses": (
@@ -48,6 +49,8 @@ NAMES = {
     "jvr.fitting.minimisers": ("LBFGSB",),
     "jvr.fitting.next_view": ("Candidate", "next_view"),
     "jvr.fitting.residuals": ("residuals",),
+    "jvr.fitting.voxel_errors": ("VoxelErrors", "voxel_errors"),
+    "jvr.fitting.voxel_priors": ("Tikhonov", "TotalVariation"),
     "jvr.fitting.bijectors": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
     "jvr.integrators.refinement": ("Refinement",),
     "jvr.integrators.slices.oracle": ("BrickRange", "Finest", "LocalError", "OpacityChange"),

@@ -10,8 +10,11 @@ from jvr.atomic import remove_parts
 from jvr.cli.inputs import BadInput
 
 CHECKPOINT, PAGE, RESULT, TRANSFER = "checkpoint.npz", "report.html", "result.json", "transfer.toml"
+VOLUME = "volume.mha"
+# Of a fit on several grids, those of the finer ones.
+CHECKPOINTS = r"checkpoint(_\d+)?\.npz"
 PICTURES = r"(target|fitted|difference)_(held_out_)?\d{2,}\.(exr|png)"
-WRITTEN = re.compile("|".join([PICTURES, *map(re.escape, (CHECKPOINT, PAGE, RESULT, TRANSFER))]))
+WRITTEN = re.compile("|".join([PICTURES, CHECKPOINTS, *map(re.escape, (PAGE, RESULT, TRANSFER, VOLUME))]))
 
 
 def results_in(folder: Path) -> list[Path]:

@@ -1,9 +1,7 @@
 """`jvr.fit`: inverse rendering, the arrays of a scene that explain its images."""
 
-import contextlib
-import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +13,7 @@ import numpy as np
 import optimistix as optx
 
 from jvr.fitting import checkpoint as checkpoints
+from jvr.fitting.bijectors import Bounded
 from jvr.fitting.continuation import continued
 from jvr.fitting.evaluator import Evaluator
 from jvr.fitting.identifiability import Identifiability, undetermined
@@ -25,6 +24,7 @@ from jvr.fitting.minimisers import OptimistixSolver
 from jvr.fitting.objective import check_derivatives
 from jvr.fitting.observations import Observations, check_settings, is_mostly_empty, keep_samples, observe
 from jvr.fitting.problem import Problem
+from jvr.fitting.progress import Iteration, progress_bar
 from jvr.fitting.reach import known_background, say_what_is_out_of_reach
 from jvr.fitting.solvers import AbstractSolver
 from jvr.fitting.targets import Targets, targets_of
@@ -43,17 +43,6 @@ KEEP_LIMIT = 2**30
 MOST_FORWARD = 512
 # Radiance of 80 dB below white: kept samples are rounded to about as much.
 INVISIBLE = 1e-4
-
-
-class Iteration(NamedTuple):
-    """One line of a fit's history: `loss` is the objective, `psnr` in decibels relative to radiance 1 (of the rays in use),
-    `seconds` since the start, `rays` the fraction of all rays in use."""
-
-    step: int
-    loss: float
-    psnr: float
-    seconds: float
-    rays: float
 
 
 class FitStats(NamedTuple):
@@ -91,7 +80,7 @@ class FitResult(NamedTuple):
     - `scene`: the fitted scene.
     - `history`: one `Iteration` for each step.
     - `standard_errors`: of every fitted value, in the structure of `unknowns(scene)`; infinite where the images do not determine it,
-      NaN for more unknowns than a Gauss-Newton matrix is made for (voxels).
+      NaN for more unknowns than a Gauss-Newton matrix is made for: those of voxels come from `jvr.voxel_errors`.
     - `unknowns`: the paths of the fitted arrays in the scene, such as `transfer.rgb`, in the order of `standard_errors`.
     - `information`: the inverse of the covariance of all fitted values, one after the other, as plain noise would have it, `(n, n)`; `None`
       where there are too many. `jvr.next_view` reads it.
@@ -212,7 +201,7 @@ def fit(
         began -= history[-1].seconds if history else 0.0
 
     outcome = solver.outcome(state)
-    with _progress(progress, max_steps) as show:
+    with progress_bar(progress, max_steps) as show:
         while outcome is None and len(history) < max_steps:
             state = solver.step(evaluator.functions, state)
             history.append(_iteration(evaluator, solver, state, len(history) + 1, time.perf_counter() - began))
@@ -270,6 +259,11 @@ def _choose(model: ExposedModel, unknowns: Callable[[Scene], Any], transforms: A
     """The scene's unknowns and then the exposure."""
     select = lambda m: (selected(unknowns, m.scene), m.exposure)
     if transforms is not None:
+        if solver.bounds is None and any(isinstance(t, Bounded) for t in transforms):
+            raise ValueError(
+                f"{type(solver).__name__} knows no bounds, which jvr.Bounded(low, high) needs: use solver=jvr.LBFGSB(), or "
+                "transforms=jvr.Sigmoid(low, high) in its place"
+            )
         transforms = (*transforms, *([None] if model.exposure is not None else []))
     return choose_unknowns(model, select, transforms, solver.bounds)
 
@@ -309,7 +303,7 @@ def _check(problem: Problem, solver: AbstractSolver, given: Targets) -> bool:
     if is_least_squares and inner > MOST_FORWARD:
         raise ValueError(
             f"{inner:,} unknowns are too many for a least-squares solver (at most {MOST_FORWARD} beside a table's entries): "
-            "use solver=optimistix.LBFGS(rtol=1e-6, atol=1e-8)"
+            "use solver=optimistix.LBFGS(rtol=1e-6, atol=1e-8), or jvr.LBFGSB() within bounds"
         )
     return is_least_squares
 
@@ -343,6 +337,8 @@ def _least_determined(
     chosen: Unknowns, model: ExposedModel, known: Identifiability, most: int = 6
 ) -> tuple[tuple[str, float], ...]:
     """The largest coefficients of the least-determined direction, with the names of their unknowns."""
+    if not np.isfinite(known.least_determined).all():
+        return ()
     labels = []
     for name, array in zip(chosen.names, chosen.values(model), strict=True):
         labels += [f"{name}[{', '.join(map(str, i))}]" for i in np.ndindex(array.shape)]
@@ -364,21 +360,3 @@ def _compare(
     exposure = 1.0 if found.exposure is None else float(found.exposure)
     pictures = [exposure * np.asarray(render(found.scene, camera, settings).rgb) for camera in cameras]
     return tuple((psnr(*pair), similarity(*pair)) for pair in zip(targets.marked(), pictures, strict=True))
-
-
-@contextlib.contextmanager
-def _progress(progress: Any, max_steps: int) -> Iterator[Callable[[Iteration], Any]]:
-    """A function to call after each iteration."""
-    if callable(progress):
-        yield progress
-    elif progress is False or (progress is None and not sys.stderr.isatty()):
-        yield lambda _: None
-    else:
-        from rich.console import Console
-        from rich.progress import Progress
-
-        with Progress(console=Console(stderr=True)) as bar:
-            task = bar.add_task("fit", total=max_steps)
-            yield lambda entry: bar.update(
-                task, completed=entry.step, description=f"step {entry.step}  loss {entry.loss:.3e}  PSNR {entry.psnr:.1f} dB"
-            )

@@ -16,6 +16,7 @@ from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.light import graded, light_parts
 from jvr.io.config.load import Config, started
 from jvr.io.config.parts import made
+from jvr.io.config.priors import priors_of, start_voxels, transforms_of
 from jvr.io.config.schema.transfer import TransferTable
 from jvr.io.config.schema.whole import FitTable, VolumeTable
 from jvr.io.config.targets import held_out_indices, views_in_files
@@ -39,6 +40,7 @@ class FitJob(NamedTuple):
     - `held_out`: cameras and images that take no part, `None` without any.
     - `keywords`: of `jvr.fit`: unknowns, solver, loss, priors, weights and so on.
     - `keeps_radiance_transfer`: whether the radiance transfer stays that of the start though the unknowns change it.
+    - `levels`: on how many grids the voxels are found (`jvr.fit_on_grids`).
     """
 
     scene: Scene
@@ -48,6 +50,7 @@ class FitJob(NamedTuple):
     held_out: tuple[tuple[AbstractCamera, ...], tuple[np.ndarray, ...]] | None
     keywords: dict[str, Any]
     keeps_radiance_transfer: bool = False
+    levels: int = 1
 
 
 def build_settings(config: Config) -> Settings:
@@ -121,21 +124,23 @@ def build_fit(
         raise ConfigError(config.name, "fit", "missing; add a table [fit] that says what to find")
     volume, settings = build_volume(config), build_settings(config)
     cameras = build_cameras(config, volume)
-    scene = _scene(started(config), volume, _start_transfer(config, fit, volume))
+    scene = _scene(started(config), start_voxels(fit, volume), _start_transfer(config, fit, volume))
     keywords = {**_keywords(config, fit), "unknowns": _unknowns(config, fit, scene), "settings": settings}
+    keywords["transforms"], levels = transforms_of(fit, scene.volume), 1 if fit.voxels is None else fit.voxels.levels
     scene = fit_scene(config, scene, precompute)
     if tables.truth is None:
         inside, outside = views_in_files(config, fit, cameras, read_image)
         keywords["weights"] = inside.weights
         held_out = (outside.cameras, outside.images) if outside.cameras else None
-        return FitJob(scene, inside.cameras, inside.images, None, held_out, keywords, keeps_radiance_transfer(config))
+        return FitJob(scene, inside.cameras, inside.images, None, held_out, keywords, keeps_radiance_transfer(config), levels)
     truth = _transfer(config, tables.truth, volume, "truth")
     true_scene = precompute(_scene(config, volume, truth))
     picture = lambda camera: np.asarray(render(true_scene, camera, settings).rgb)
     extra = _extra_cameras(config, fit, cameras, volume)
     inside, outside = ([c for c, out in extra if out == which] for which in (False, True))
     held_out = (tuple(outside), tuple(map(picture, outside))) if outside else None
-    return FitJob(scene, tuple(inside), tuple(map(picture, inside)), truth, held_out, keywords, keeps_radiance_transfer(config))
+    keeps, images = keeps_radiance_transfer(config), tuple(map(picture, inside))
+    return FitJob(scene, tuple(inside), images, truth, held_out, keywords, keeps, levels)
 
 
 def _builtin() -> Volume:
@@ -212,7 +217,7 @@ def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:
     return {
         "solver": _solver(fit),
         "loss": losses[fit.loss](),
-        "priors": _priors(config, fit),
+        "priors": priors_of(fit),
         "exposure": fit.exposure,
         "keep_samples": fit.keep_samples,
         "smooth_undetermined": fit.smooth_undetermined,
@@ -237,14 +242,6 @@ def _solver(fit: FitTable) -> Any:
         return optx.OptaxMinimiser(optax.adam(fit.learning_rate), rtol=rtol, atol=rtol)
     quasi_newton = {"bfgs": optx.BFGS, "lbfgs": optx.LBFGS}[fit.solver]
     return quasi_newton(rtol=rtol, atol=1e-2 * rtol)
-
-
-def _priors(config: Config, fit: FitTable) -> tuple[Any, ...]:
-    from jvr.fitting.losses import ColourSmoothness, ExtinctionSmoothness, Sparsity
-
-    kinds = {"colour_smoothness": ColourSmoothness, "extinction_smoothness": ExtinctionSmoothness, "sparsity": Sparsity}
-    strengths = {name: getattr(fit.priors, name) for name in kinds}
-    return tuple(kinds[name](strength) for name, strength in strengths.items() if strength)
 
 
 def _unknowns(config: Config, fit: FitTable, scene: Scene) -> Callable[[Scene], Any]:
