@@ -33,8 +33,8 @@ NAMES = {
     "jvr.effects.shadow_rays": ("ShadowRays",),
     "jvr.effects.shadow_volume": ("OpacityShadowMap", "ShadowVolume"),
     "jvr.execution.devices": ("use_all_cores",),
-    "jvr.fitting.fit": ("FitResult", "fit"),
     "jvr.fitting.grids": ("fit_on_grids",),
+    "jvr.fitting.fit": ("fit",),
     "jvr.fitting.initialise": ("colours_given_extinction", "flat_transfer"),
     "jvr.fitting.least_squares": ("Dogleg", "GaussNewton", "LevenbergMarquardt"),
     "jvr.fitting.losses": (
@@ -51,6 +51,8 @@ NAMES = {
     "jvr.fitting.residuals": ("residuals",),
     "jvr.fitting.voxel_errors": ("VoxelErrors", "voxel_errors"),
     "jvr.fitting.voxel_priors": ("Tikhonov", "TotalVariation"),
+    "jvr.fitting.result": ("FitResult",),
+    "jvr.fitting.unknowns": ("shared",),
     "jvr.fitting.bijectors": ("Bounded", "Identity", "Ordered", "Sigmoid", "Softplus"),
     "jvr.integrators.refinement": ("Refinement",),
     "jvr.integrators.slices.oracle": ("BrickRange", "Finest", "LocalError", "OpacityChange"),

@@ -13,13 +13,15 @@ from typing import Any
 import numpy as np
 
 from jvr.cli.beforehand import Beforehand
-from jvr.cli.folder import CHECKPOINT, CHECKPOINTS, PAGE, RESULT, TRANSFER, VOLUME, alone_in, check_results, results_in
+from jvr.cli.folder import CAMERAS, CHECKPOINT, CHECKPOINTS, PAGE, RESULT, TRANSFER, VOLUME, alone_in, check_results, results_in
 from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by_jvr, warnings_as_lines
 from jvr.cli.runtime import nested, plain, progress, provenance, start_jax
 from jvr.cli.signals import INTERRUPTED, Terminated, said
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
+from jvr.io.config.cameras import write_cameras
 from jvr.io.config.parts import choices_of
 from jvr.io.volumes.written import write_metaimage
+from jvr.model.exact import in_double
 
 
 def demo_config() -> Path:
@@ -90,7 +92,7 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
 def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float, beforehand: Beforehand) -> dict[str, Any]:
     from jvr.atomic import replacing
 
-    fitted = _pictures(result.scene, result.exposure, job.cameras, job)
+    fitted = _pictures(result.scene, result.exposure, result.cameras, job)
     # Of another run: it may have had more views.
     for path in results_in(folder):
         if not re.fullmatch(CHECKPOINTS, path.name):
@@ -104,6 +106,7 @@ def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float,
     write_transfer(folder / TRANSFER, result.scene.transfer)
     if "volume.values" in result.unknowns:
         write_metaimage(folder / VOLUME, result.scene.volume)
+    write_cameras(folder / CAMERAS, result.cameras)
     report = _report(config, job, result, (fitted, held_fitted))
     report["transfer_kept"] = _with_transfer_of_its_own(job, result, beforehand) if job.keeps_radiance_transfer else None
     report |= {"precomputed": beforehand.report, "seconds": time.perf_counter() - began}
@@ -118,7 +121,7 @@ def _with_transfer_of_its_own(job: FitJob, result: Any, beforehand: Beforehand) 
     import equinox as eqx
 
     scene = beforehand(eqx.tree_at(lambda s: s.radiance_transfer.projected, result.scene, None))
-    return _scores(job.targets, _pictures(scene, result.exposure, job.cameras, job))
+    return _scores(job.targets, _pictures(scene, result.exposure, result.cameras, job))
 
 
 def _pictures(scene: Any, exposure: float, cameras: Any, job: FitJob) -> list[np.ndarray]:
@@ -181,6 +184,7 @@ def _report(config: Config, job: FitJob, result: Any, pictures: Any) -> dict[str
         "structured": stats.structured,
         "design_effect": plain(stats.design_effect),
         "smoothed": dict(stats.smoothed),
+        "cameras": [in_double(c.world_from_camera, c.remainder).tolist() for c in result.cameras],
         "worst_determined": [[name, plain(share)] for name, share in stats.worst],
         "kept_bytes": stats.kept_bytes,
         "page": PAGE,

@@ -13,8 +13,9 @@ CHECKPOINT, PAGE, RESULT, TRANSFER = "checkpoint.npz", "report.html", "result.js
 VOLUME = "volume.mha"
 # Of a fit on several grids, those of the finer ones.
 CHECKPOINTS = r"checkpoint(_\d+)?\.npz"
+CAMERAS = "cameras.toml"
 PICTURES = r"(target|fitted|difference)_(held_out_)?\d{2,}\.(exr|png)"
-WRITTEN = re.compile("|".join([PICTURES, CHECKPOINTS, *map(re.escape, (PAGE, RESULT, TRANSFER, VOLUME))]))
+WRITTEN = re.compile("|".join([PICTURES, CHECKPOINTS, *map(re.escape, (PAGE, RESULT, TRANSFER, CAMERAS, VOLUME))]))
 
 
 def results_in(folder: Path) -> list[Path]:

@@ -153,6 +153,33 @@ class Direction(AbstractBijector):
         return np.full(unconstrained.shape, 0.5)
 
 
+# Degrees, and the way of a point at the volume's surface as it turns by as much.
+MOTION_RADIUS = 10.0
+
+
+class Motion(AbstractBijector):
+    """Motions of a pose (`jvr.model.motion`) about the centre of a volume of a `radius`: rotations in degrees, translations in units that
+    move the volume's surface as far."""
+
+    radius: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+
+    def forward(self, unconstrained: Float[Array, "6"]) -> Float[Array, "6"]:
+        return unconstrained * self._unit
+
+    def inverse(self, value: Float[Array, "6"]) -> Float[Array, "6"]:
+        return value / self._unit
+
+    def bounds(self, unconstrained: Float[np.ndarray, "..."]) -> Bounds:
+        return _unbounded(unconstrained)
+
+    def trust_radius(self, unconstrained: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        return np.full(unconstrained.shape, MOTION_RADIUS)
+
+    @property
+    def _unit(self) -> Float[Array, "6"]:
+        return jnp.concatenate([jnp.ones(3, self.radius.dtype), jnp.full(3, jnp.deg2rad(self.radius))])
+
+
 class Ordered(AbstractBijector):
     """Strictly increasing values with both ends free: the first as it is, then softplus of every gap over the mean gap."""
 

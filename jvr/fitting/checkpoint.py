@@ -27,7 +27,7 @@ class CheckpointError(ValueError):
     """A checkpoint that does not belong to this fit, or cannot be read."""
 
 
-def fingerprint(problem: Problem, given: tuple[Any, Any, Any], solver: Any) -> Fingerprint:
+def fingerprint(problem: Problem, given: tuple[Any, Any, Any], solver: Any, coarse_levels: int = 0) -> Fingerprint:
     """A digest of each thing that a fit depends on, by its name: a checkpoint is not taken up by another fit. `given`: cameras, images and
     weights."""
     scene = {field.name: getattr(problem.model.scene, field.name) for field in dataclasses.fields(problem.model.scene)}
@@ -42,6 +42,7 @@ def fingerprint(problem: Problem, given: tuple[Any, Any, Any], solver: Any) -> F
         "kept samples": problem.samples is None,
         "solver": solver,
     }
+    parts |= {"coarse levels": coarse_levels} if coarse_levels else {}
     return {name: hashlib.sha256(f"{FORMAT}{_canonical(part)}".encode()).hexdigest()[:16] for name, part in parts.items()}
 
 

@@ -217,7 +217,9 @@ def _levels(problem: Problem, observations: Observations) -> tuple[int, ...]:
     """All rays, after a subset that still over-determines the unknowns where that is much smaller."""
     unknowns = sum(v.size for v in problem.unknowns.values(problem.model))
     every = min(MOST_THINNING, 3 * observations.size // max(LEAST_RESIDUALS * unknowns, observations.chunk))
-    return (1,) if every < 2 else (every, 1)
+    # Where a subset fills as many tiles it takes as long.
+    saves = lambda: problem.model.views is None or observations.tile_count(every) < observations.tile_count()
+    return (every, 1) if every >= 2 and saves() else (1,)
 
 
 _mean_squares = eqx.filter_jit(value)

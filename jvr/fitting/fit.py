@@ -1,20 +1,23 @@
 """`jvr.fit`: inverse rendering, the arrays of a scene that explain its images."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import Array, Float
 
-from jvr.fitting import checkpoint as checkpoints
+from jvr.fitting import coarse
 from jvr.fitting.bijectors import Bounded
+from jvr.fitting.checkpoint import fingerprint
 from jvr.fitting.continuation import continued
+from jvr.fitting.descent import Checkpoint, Descent
 from jvr.fitting.evaluator import Evaluator
 from jvr.fitting.identifiability import Identifiability, undetermined
 from jvr.fitting.kinds import march_unknowns
@@ -24,11 +27,12 @@ from jvr.fitting.minimisers import OptimistixSolver
 from jvr.fitting.objective import check_derivatives
 from jvr.fitting.observations import Observations, check_settings, is_mostly_empty, keep_samples, observe
 from jvr.fitting.problem import Problem
-from jvr.fitting.progress import Iteration, progress_bar
 from jvr.fitting.reach import known_background, say_what_is_out_of_reach
+from jvr.fitting.result import FitResult, FitStats, Iteration
 from jvr.fitting.solvers import AbstractSolver
 from jvr.fitting.targets import Targets, targets_of
-from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns, selected
+from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns, is_shared, selected, takes_cameras
+from jvr.fitting.views import Views
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
@@ -41,80 +45,6 @@ from jvr.types import Outcome
 KEEP_LIMIT = 2**30
 # The Jacobian of other unknowns than a table's entries takes one march for each.
 MOST_FORWARD = 512
-# Radiance of 80 dB below white: kept samples are rounded to about as much.
-INVISIBLE = 1e-4
-
-
-class FitStats(NamedTuple):
-    """What a fit took and how well it is determined.
-
-    - `seconds`; `kept_bytes`: of samples kept along the rays, 0 where they were resampled.
-    - `residual_variance`, `rank`, `condition`: of the Gauss-Newton matrix at the end, see `jvr.fitting.identifiability`.
-    - `structured`: whether neighbouring residuals have something in common, so that the model cannot explain the images whatever its
-      unknowns; standard errors are then those of the sandwich. `design_effect`: by how much, 1 for noise.
-    - `smoothed`: how many entries of each unknown array were continued from their neighbours, since the images do not determine them.
-    - `worst`: the least-determined direction of the unknowns, as (name, coefficient), largest first.
-    - `held_out`: (PSNR, SSIM) of each held-out view, radiance 0 ... 1.
-    """
-
-    seconds: float
-    kept_bytes: int
-    residual_variance: float
-    rank: int
-    condition: float
-    worst: tuple[tuple[str, float], ...]
-    held_out: tuple[tuple[float, float], ...]
-    structured: bool = False
-    design_effect: float = float("nan")
-    smoothed: tuple[tuple[str, int], ...] = ()
-
-    @property
-    def is_misfit(self) -> bool:
-        """Whether residuals are structured and large enough to be seen: a root mean square above `INVISIBLE`."""
-        return self.structured and self.residual_variance > INVISIBLE**2
-
-
-class FitResult(NamedTuple):
-    """What `jvr.fit` returns.
-
-    - `scene`: the fitted scene.
-    - `history`: one `Iteration` for each step.
-    - `standard_errors`: of every fitted value, in the structure of `unknowns(scene)`; infinite where the images do not determine it,
-      NaN for more unknowns than a Gauss-Newton matrix is made for: those of voxels come from `jvr.voxel_errors`.
-    - `unknowns`: the paths of the fitted arrays in the scene, such as `transfer.rgb`, in the order of `standard_errors`.
-    - `information`: the inverse of the covariance of all fitted values, one after the other, as plain noise would have it, `(n, n)`; `None`
-      where there are too many. `jvr.next_view` reads it.
-    - `outcome`: how the iteration ended.
-    - `exposure`: the fitted factor between rendered and target radiance, 1 where it was not asked for.
-    - `stats`: `FitStats`.
-    """
-
-    scene: Scene
-    history: tuple[Iteration, ...]
-    standard_errors: Any
-    unknowns: tuple[str, ...]
-    outcome: Outcome
-    exposure: float
-    stats: FitStats
-    information: np.ndarray | None = None
-
-    @property
-    def errors_by_name(self) -> dict[str, np.ndarray]:
-        """The standard errors of each fitted array, by its path in the scene."""
-        return dict(zip(self.unknowns, map(np.asarray, jax.tree.leaves(self.standard_errors)), strict=True))
-
-    def _repr_html_(self) -> str:
-        """What notebooks show: how the fit ended, how sure its values are, and the transfer function."""
-        last = f", PSNR {self.history[-1].psnr:.1f} dB" if self.history else ""
-        lines = [f"Fit: {self.outcome.value} after {len(self.history)} steps, {self.stats.seconds:.1f} s{last}"]
-        lines += [f"held-out view: PSNR {psnr:.1f} dB, SSIM {ssim:.4f}" for psnr, ssim in self.stats.held_out]
-        for name, errors in self.errors_by_name.items():
-            known = errors[np.isfinite(errors)]
-            middle = f"standard error {np.median(known):.2g} (median), " if known.size else ""
-            lines.append(f"{name}: {middle}{errors.size - known.size} of {errors.size} not determined by the images")
-        lines += [f"{name}: {count} values continued from their neighbours" for name, count in self.stats.smoothed]
-        lines += ["neighbouring residuals are alike: the model does not explain the images"] if self.stats.is_misfit else []
-        return f"<div>{'<br>'.join(map(escape, lines))}{self.scene.transfer._repr_html_()}</div>"
 
 
 def fit(
@@ -122,7 +52,7 @@ def fit(
     cameras: Sequence[AbstractCamera],
     images: Any,
     *,
-    unknowns: Callable[[Scene], Any],
+    unknowns: Callable[..., Any],
     settings: Settings = Settings(),
     solver: AbstractSolver | optx.AbstractMinimiser | optx.AbstractLeastSquaresSolver | None = None,
     loss: AbstractLoss | DSSIM = SquaredError(),
@@ -133,6 +63,7 @@ def fit(
     held_out: tuple[Sequence[AbstractCamera], Any] | None = None,
     keep_samples: bool | int = True,
     smooth_undetermined: bool = True,
+    coarse_levels: int = 0,
     max_steps: int = 100,
     checkpoint: str | Path | None = None,
     resume: bool = False,
@@ -145,7 +76,10 @@ def fit(
     - `scene`: where the fit starts; what is not unknown stays as it is.
     - `cameras`, `images`: one target image `(height, width, 3)`, linear radiance, for each camera, each of its own size. Pixels that are
       not finite have weight 0. Images `(height, width, 4)`, light over black and alpha, are put over the scene's background.
-    - `unknowns`: picks arrays out of the scene by their place, for example `lambda s: (s.transfer.rgb, s.transfer.sigma_t)`.
+    - `unknowns`: picks arrays out of the scene by their place, for example `lambda s: (s.transfer.rgb, s.transfer.sigma_t)`; a function of
+      two arguments also out of the cameras, `lambda s, cameras: [c.world_from_camera for c in cameras]`; `jvr.shared` makes one value
+      of several of them. A pose is six numbers: a rotation of the camera about the centre of the volume, in degrees, and a translation,
+      as a world length, both in the world's axes (`jvr.model.motion`).
     - `solver`: `None` is `jvr.LevenbergMarquardt()`; also `jvr.GaussNewton()`, `jvr.Dogleg()`, `jvr.LBFGSB()`, or any minimiser or
       least-squares solver of Optimistix.
     - `loss`: `jvr.SquaredError()`, `jvr.Huber()`, `jvr.AbsoluteError()` or, for solvers that use gradients alone, `jvr.DSSIM()`.
@@ -157,61 +91,62 @@ def fit(
       the volume again; a number is the most bytes to take (`True`: 1 GiB), beyond which every step resamples.
     - `smooth_undetermined`: continue entries of a table that the images do not determine smoothly from those that they do, in place of what
       the iteration left there (`jvr.fitting.continuation`); it adds at most 0.01 dB of error.
-    - `max_steps`: iterations at most. `checkpoint`: a file written after every iteration, from which `resume=True` goes on.
+    - `coarse_levels`: so many times the fit begins with pictures averaged over squares of 3 pixels a side, 9, 27 and so on, coarsest
+      first, and voxels averaged to about the size of such a pixel (`jvr.fitting.coarse`): from there poses are found that are many
+      pixels away, as a rule of two levels some 10 degrees. Levels whose pictures would have fewer than 8 pixels a side are left out.
+    - `max_steps`: iterations at most, those of all levels together.
+    - `checkpoint`: a file written after every iteration on whole pictures, from which `resume=True` goes on.
     - `progress`: `None` shows a bar on stderr where that is a terminal; a function is called with each `Iteration`.
 
     Standard errors are those of weighted least squares at the solution, in the values' own coordinates, priors excluded; with a
     robust loss its final weights count as the weights. Where neighbouring residuals have something in common (another
     renderer's sampling, a camera's blur) they are those of a sandwich estimate, see `jvr.fitting.identifiability`. `settings.adjoint` plays
-    no part: each solver has its own.
+    no part: each solver has its own. Those of a pose are six: of a rotation about the centre of the volume, in degrees about the x, y and z
+    axes of the world, and of a translation of it along these, in the world's unit, both at the solution.
 
     What the targets show and no values of the unknowns can is said: another background than the scene's, light that its colours do not
     reach, a camera that sees nothing of the volume.
 
-    **Raises** `ValueError` for images that do not fit the cameras, unknowns that are not arrays of the scene, too many unknowns for
-    a least-squares solver, a loss that the solver cannot use, cameras that all miss the volume, or an integrator whose radiance has no
-    derivative. A non-finite value ends the fit with that outcome and the last good iterate.
+    **Raises** `ValueError` for images that do not fit the cameras, unknowns that are not arrays of the scene or the cameras, too many
+    unknowns for a least-squares solver, a loss that the solver cannot use, cameras that all miss the volume, an unknown camera that sees
+    nothing of it, or an integrator whose radiance has no derivative. A non-finite value ends the fit with that outcome and the last
+    good iterate.
     """
     began = time.perf_counter()
     solver = _as_solver(solver)
     check_settings(settings)
-    scene = scene.current()
-    model = ExposedModel(scene, jnp.ones(()) if exposure else None)
-    chosen = _choose(model, unknowns, transforms, solver)
-    model = _without_stale(model, chosen)
-    scene, chosen = model.scene, _choose(model, unknowns, transforms, solver)
+    scene, views = scene.current(), () if isinstance(cameras, AbstractCamera) else tuple(cameras)
+    model = _with_views(ExposedModel(scene, jnp.ones(()) if exposure else None), views, unknowns)
+    choose = lambda model: _choose(model, views, unknowns, transforms, solver)
+    model = _without_stale(model, choose(model))
+    scene, chosen = model.scene, choose(model)
     behind = known_background(model, chosen)
     targets, weights = given = targets_of(cameras, images, weights, behind)
     held = None if held_out is None else (held_out[0], targets_of(*held_out, None, behind, "held-out image"))
     start = chosen.model_from_unconstrained(model, chosen.unconstrained_from_model(model))
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
-    forwards = _check(problem, solver, given)
+    forwards = _check(problem, solver, given, coarse_levels)
     say_what_is_out_of_reach(problem, given)
 
-    problem, observations = _keep(problem, observe(scene, cameras, targets, weights, settings), keep_samples)
+    unknown = chosen.views(model)
+    observations = observe(scene, cameras, targets, weights, settings, unknown=unknown)
+    problem, observations = _keep(problem, observations, keep_samples)
     check_derivatives(problem, observations, forwards=forwards)
     evaluator = Evaluator(problem, observations, cameras, targets)
-    mark = checkpoints.fingerprint(problem, (cameras, targets, weights), solver) if checkpoint else {}
-    # The observations hold them.
-    del targets, given
-    state, history = solver.init(evaluator.functions, chosen.unconstrained_from_model(model)), []
-    if checkpoint and resume and Path(checkpoint).exists():
-        state, rows = checkpoints.load(Path(checkpoint), state, mark)
-        history = [Iteration(**row) for row in rows]
-        began -= history[-1].seconds if history else 0.0
-
-    outcome = solver.outcome(state)
-    with progress_bar(progress, max_steps) as show:
-        while outcome is None and len(history) < max_steps:
-            state = solver.step(evaluator.functions, state)
-            history.append(_iteration(evaluator, solver, state, len(history) + 1, time.perf_counter() - began))
-            if checkpoint:
-                checkpoints.save(Path(checkpoint), state, [entry._asdict() for entry in history], mark)
-            show(history[-1])
-            outcome = solver.outcome(state)
-
-    unconstrained, _ = solver.iterate(state)
-    values = chosen.values_from_unconstrained(jnp.asarray(unconstrained), model)
+    file = None
+    if checkpoint:
+        file = Checkpoint(Path(checkpoint), fingerprint(problem, (cameras, targets, weights), solver, coarse_levels), resume)
+    with Descent(solver, max_steps, began, progress) as descent:
+        # What is taken up again has left the coarse levels behind.
+        for factor in () if file and file.is_there else coarse.factors(views, coarse_levels):
+            rough, rays = coarse.level(problem, model, given, views, factor, choose, unknown)
+            found = descent.run(Evaluator(rough, rays, views, None), rough, share=rays.size / observations.size)
+            model = chosen.insert(model, rough.unknowns.split(found, rough.model))
+        # The observations hold them.
+        del targets, given
+        values = descent.run(evaluator, problem, chosen.unconstrained_from_model(model), file)
+    problem, values = _settled(problem, values)
+    evaluator.problem, model = problem, problem.model
     known, quiet = undetermined(values.size), np.zeros(values.size, bool)
     if march_unknowns(problem) <= MOST_FORWARD:
         known, around = evaluator.solution(values)
@@ -220,7 +155,7 @@ def fit(
             values = jnp.asarray(moved, values.dtype)
     found = chosen.insert(model, chosen.split(values, model))
     errors = chosen.split(jnp.asarray(known.standard_errors), model)
-    selected, structure = jax.tree.flatten(unknowns(scene))
+    picked, structure = jax.tree.flatten(selected(unknowns, scene, views), is_leaf=is_shared)
     stats = FitStats(
         seconds=time.perf_counter() - began,
         kept_bytes=0 if problem.samples is None else problem.samples.bytes,
@@ -235,13 +170,14 @@ def fit(
     )
     return FitResult(
         scene=found.scene,
-        history=tuple(history),
-        standard_errors=jax.tree.unflatten(structure, errors[: len(selected)]),
-        unknowns=chosen.names[: len(selected)],
+        history=tuple(descent.history),
+        standard_errors=jax.tree.unflatten(structure, errors[: len(picked)]),
+        unknowns=chosen.names[: len(picked)],
         information=known.information,
-        outcome=outcome or Outcome.STEP_LIMIT,
+        outcome=descent.outcome or Outcome.STEP_LIMIT,
         exposure=1.0 if found.exposure is None else float(found.exposure),
         stats=stats,
+        cameras=views if found.views is None else found.views.cameras,
     )
 
 
@@ -255,9 +191,22 @@ def _as_solver(solver: Any) -> AbstractSolver:
     raise TypeError(f"solver must be one of jvr's or Optimistix's, not {type(solver).__name__}")
 
 
-def _choose(model: ExposedModel, unknowns: Callable[[Scene], Any], transforms: Any, solver: AbstractSolver) -> Unknowns:
-    """The scene's unknowns and then the exposure."""
-    select = lambda m: (selected(unknowns, m.scene), m.exposure)
+def _with_views(model: ExposedModel, cameras: tuple[AbstractCamera, ...], unknowns: Any) -> ExposedModel:
+    """The model with its cameras, where the function `unknowns` names any of their arrays: what names none knows nothing of them."""
+    if not cameras or not takes_cameras(unknowns):
+        return model
+    with_views = dataclasses.replace(model, views=Views.at_rest(cameras))
+    return with_views if choose_unknowns(with_views, _select(unknowns, cameras)).views(with_views) else model
+
+
+def _select(unknowns: Any, cameras: tuple[AbstractCamera, ...]) -> Callable[[ExposedModel], Any]:
+    """The unknowns and then the exposure."""
+    return lambda m: (selected(unknowns, m.scene, cameras if m.views is None else m.views.shown), m.exposure)
+
+
+def _choose(
+    model: ExposedModel, cameras: tuple[AbstractCamera, ...], unknowns: Any, transforms: Any, solver: AbstractSolver
+) -> Unknowns:
     if transforms is not None:
         if solver.bounds is None and any(isinstance(t, Bounded) for t in transforms):
             raise ValueError(
@@ -265,7 +214,7 @@ def _choose(model: ExposedModel, unknowns: Callable[[Scene], Any], transforms: A
                 "transforms=jvr.Sigmoid(low, high) in its place"
             )
         transforms = (*transforms, *([None] if model.exposure is not None else []))
-    return choose_unknowns(model, select, transforms, solver.bounds)
+    return choose_unknowns(model, _select(unknowns, cameras), transforms, solver.bounds)
 
 
 def _without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
@@ -280,7 +229,7 @@ def _without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
     return model
 
 
-def _check(problem: Problem, solver: AbstractSolver, given: Targets) -> bool:
+def _check(problem: Problem, solver: AbstractSolver, given: Targets, coarse_levels: int) -> bool:
     """Refuses combinations that cannot work; whether derivatives are taken in forward mode."""
     is_least_squares = isinstance(solver, ChunkedLeastSquares) or (
         isinstance(solver, OptimistixSolver) and isinstance(solver.solver, optx.AbstractLeastSquaresSolver)
@@ -288,6 +237,10 @@ def _check(problem: Problem, solver: AbstractSolver, given: Targets) -> bool:
     if is_least_squares and isinstance(problem.loss, DSSIM):
         raise ValueError(
             "DSSIM is not a sum over pixels and has no least-squares form: use solver=optimistix.BFGS(rtol=1e-6, atol=1e-8)"
+        )
+    if isinstance(problem.loss, DSSIM) and (problem.model.views is not None or coarse_levels):
+        raise ValueError(
+            "DSSIM compares whole images of known cameras: use loss=jvr.AbsoluteError() for unknown cameras and coarse_levels"
         )
     if isinstance(problem.loss, DSSIM) and given.are_weighted:
         raise ValueError(
@@ -311,7 +264,7 @@ def _check(problem: Problem, solver: AbstractSolver, given: Targets) -> bool:
 def _keep(problem: Problem, observations: Observations, keep: bool | int) -> tuple[Problem, Observations]:
     """Samples along the rays, where the volume and its clipping are known and memory allows."""
     among = lambda select: problem.unknowns.among(problem.model, select)
-    moving = among(lambda m: (m.scene.volume, m.scene.clipping))
+    moving = problem.model.views is not None or among(lambda m: (m.scene.volume, m.scene.clipping))
     # What is kept is the scalar alone.
     only_scalars = problem.integrator.marches and not problem.model.scene.needs_gradient
     if keep is False or moving or not only_scalars or isinstance(problem.loss, DSSIM):
@@ -326,11 +279,14 @@ def _keep(problem: Problem, observations: Observations, keep: bool | int) -> tup
     return problem.with_samples(kept[0]), kept[1]
 
 
-def _iteration(evaluator: Evaluator, solver: AbstractSolver, state: Any, step: int, seconds: float) -> Iteration:
-    unconstrained, loss = solver.iterate(state)
-    level = int(getattr(state, "level", -1))
-    psnr = evaluator.psnr(unconstrained, loss, getattr(state, "normal", None))
-    return Iteration(step, loss, psnr, seconds, evaluator.fraction(level))
+def _settled(problem: Problem, values: Float[Array, "unknowns"]) -> tuple[Problem, Float[Array, "unknowns"]]:
+    """The problem at the end of its iteration, its cameras at rest where they have come to, and its values there."""
+    model = problem.unknowns.insert(problem.model, problem.unknowns.split(values, problem.model))
+    if model.views is None:
+        return problem, values
+    model = dataclasses.replace(model, views=model.views.settled(model.scene))
+    values = jnp.concatenate([jnp.ravel(value) for value in problem.unknowns.values(model)])
+    return eqx.tree_at(lambda p: p.model, problem, model), values
 
 
 def _least_determined(

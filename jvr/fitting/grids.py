@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 
-from jvr.fitting.fit import FitResult, fit
-from jvr.fitting.progress import Iteration, progress_bar
+from jvr.fitting.fit import fit
+from jvr.fitting.result import FitResult, Iteration
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns, selected
 from jvr.model.camera import AbstractCamera
 from jvr.model.grids import Shape, coarser, on_grid
@@ -19,7 +20,7 @@ def fit_on_grids(
     cameras: Sequence[AbstractCamera],
     images: Any,
     *,
-    unknowns: Callable[[Scene], Any],
+    unknowns: Callable[..., Any],
     levels: int = 3,
     held_out: tuple[Sequence[AbstractCamera], Any] | None = None,
     max_steps: int = 100,
@@ -41,11 +42,11 @@ def fit_on_grids(
     Returns the fit on the last grid, with the history and the seconds of all.
     **Raises** `ValueError` as `jvr.fit`, where the voxels are not unknown or some are missing, and where there are not so many grids.
     """
-    shapes = _shapes(scene.volume.shape, levels)
-    model = ExposedModel(scene, None)
-    chosen = choose_unknowns(model, lambda m: selected(unknowns, m.scene))
-    if not chosen.among(model, lambda m: m.scene.volume.values):
-        raise ValueError(f"grids are for voxels, and {', '.join(chosen.names)} are asked for: name volume.values, or use jvr.fit")
+    shapes, voxels = _shapes(scene.volume.shape, levels), scene.volume.values
+    # Refuses integers, which a coarser grid would make floating-point numbers of.
+    choose_unknowns(ExposedModel(scene, None), lambda m: m.scene.volume.values)
+    if not any(array is voxels for array in jax.tree.leaves(selected(unknowns, scene, tuple(cameras)))):
+        raise ValueError("levels are grids of voxels, which are not asked for: name volume.values, or use jvr.fit")
     files = [None if checkpoint is None else level_file(Path(checkpoint), level) for level in range(levels)]
     for file in () if resume else files:
         # Of an earlier run: another one that is interrupted would find it.
@@ -53,21 +54,21 @@ def fit_on_grids(
             file.unlink(missing_ok=True)
     history: list[Iteration] = []
     result = None
-    with progress_bar(progress, levels * max_steps) as show:
-        for level, (shape, file) in enumerate(zip(shapes, files, strict=True)):
-            result = fit(
-                eqx.tree_at(lambda s: s.volume, scene, on_grid(scene.volume, shape)),
-                cameras,
-                images,
-                unknowns=unknowns,
-                held_out=held_out if level == levels - 1 else None,
-                max_steps=max_steps,
-                checkpoint=file,
-                resume=resume,
-                progress=_following(history, show),
-                **keywords,
-            )
-            scene, history = result.scene, [*history, *(_later(entry, history) for entry in result.history)]
+    for level, (shape, file) in enumerate(zip(shapes, files, strict=True)):
+        result = fit(
+            eqx.tree_at(lambda s: s.volume, scene, on_grid(scene.volume, shape)),
+            cameras,
+            images,
+            unknowns=unknowns,
+            held_out=held_out if level == levels - 1 else None,
+            max_steps=max_steps,
+            checkpoint=file,
+            resume=resume,
+            progress=_following(history, progress) if callable(progress) else progress,
+            **keywords,
+        )
+        scene, cameras = result.scene, result.cameras
+        history = [*history, *(_later(entry, history) for entry in result.history)]
     assert result is not None
     seconds = history[-1].seconds if history else result.stats.seconds
     return result._replace(history=tuple(history), stats=result.stats._replace(seconds=max(seconds, result.stats.seconds)))

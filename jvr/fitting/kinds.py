@@ -24,21 +24,44 @@ class TableEntries(NamedTuple):
     sigma_t: np.ndarray | None = None
 
 
+class OfViews(NamedTuple):
+    """Unknown cameras: each ray depends on those of its own view alone, so that one direction serves all views.
+
+    - `shapes`: of the fields in question, by name.
+    - `columns`: for each view and direction the index of the unknown in the vector of all, their number where that view's is known,
+      `(views, directions)`.
+    """
+
+    shapes: dict[str, tuple[int, ...]]
+    columns: np.ndarray
+
+    def basis(self, dtype: Any) -> dict[str, Array]:
+        """The directions: a shift of every field, with a leading axis."""
+        sizes = [int(np.prod(shape)) for shape in self.shapes.values()]
+        parts = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
+        return {
+            name: jnp.asarray(part.reshape(-1, *shape), dtype)
+            for (name, shape), part in zip(self.shapes.items(), parts, strict=True)
+        }
+
+
 class Kinds(NamedTuple):
     """Indices of the unknowns in the vector of all by how they act: as `entries` of a table (rows), after the march (`outer`), or inside
-    it (`inner`). `directions`: indices in `inner` that are moved together, one for each channel of the picture."""
+    it (`inner`). `directions`: indices in `inner` that are moved together, one for each channel of the picture. `of_views`: of cameras,
+    `None` where these are known."""
 
     problem: Problem
     entries: TableEntries
     outer: np.ndarray
     inner: np.ndarray
     directions: np.ndarray
+    of_views: OfViews | None
 
     @classmethod
     def of(cls, problem: Problem) -> "Kinds":
         unknowns, model = problem.unknowns, problem.model
         after, (rgb, sigma_t) = _after_march(problem), _in_table(problem)
-        entries = TableEntries()
+        entries, places, starts = TableEntries(), unknowns.seen_from(model), {}
         outer, inner, directions = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros((0, 3), int)]
         begin, taken = 0, 0
         for i, array in enumerate(unknowns.values(model)):
@@ -48,6 +71,8 @@ class Kinds(NamedTuple):
                 entries = entries._replace(rgb=indices.reshape(array.shape))
             elif i in sigma_t:
                 entries = entries._replace(sigma_t=indices.reshape(array.shape))
+            elif i in places:
+                starts[i] = int(indices[0])
             elif i in after:
                 outer.append(indices)
             else:
@@ -57,7 +82,8 @@ class Kinds(NamedTuple):
                 # A colour of light is seen in that colour alone: one march for all three.
                 apart = unknowns.by_channel[i] and array.shape[-1:] == (3,)
                 directions.append(own.reshape(-1, 3) if apart else np.repeat(own[:, None], 3, axis=1))
-        return cls(problem, entries, np.concatenate(outer), np.concatenate(inner), np.concatenate(directions))
+        of_views = _of_views(problem, places, starts) if places else None
+        return cls(problem, entries, np.concatenate(outer), np.concatenate(inner), np.concatenate(directions), of_views)
 
     def basis(self, dtype: Any) -> Float[Array, "directions inner"]:
         """`directions` as vectors."""
@@ -78,6 +104,21 @@ class Kinds(NamedTuple):
         return unknowns.insert(model, arrays)
 
 
+def _of_views(problem: Problem, places: dict[int, list[tuple[str, int]]], starts: dict[int, int]) -> OfViews:
+    """`places`: fields and views of each unknown array of cameras; `starts`: where its values are in the vector of all."""
+    values = problem.unknowns.values(problem.model)
+    shapes = {field: values[i].shape for i, found in places.items() for field, _ in found}
+    views = problem.model.views
+    assert views is not None
+    columns = {
+        name: np.full((len(views.cameras), int(np.prod(shape))), sum(v.size for v in values)) for name, shape in shapes.items()
+    }
+    for i, found in places.items():
+        for field, view in found:
+            columns[field][view] = starts[i] + np.arange(values[i].size)
+    return OfViews(shapes, np.concatenate(list(columns.values()), axis=1))
+
+
 def march_unknowns(problem: Problem) -> int:
     """How many derivatives are taken by forward mode, at the cost of a march each."""
     return len(Kinds.of(problem).directions)
@@ -87,7 +128,7 @@ def adjoint_of(problem: Problem) -> AbstractAdjoint:
     """How the whole residual vector is differentiated."""
     # Rows do not know light that changes on its way: that of an environment, through a radiance transfer.
     around = lambda m: () if m.scene.radiance_transfer is None else (m.scene.environment_lights, m.scene.radiance_transfer)
-    known = _has_rows(problem) and not problem.unknowns.among(problem.model, around)
+    known = _has_rows(problem) and not problem.unknowns.among(problem.model, around) and problem.model.views is None
     return Rows() if known else Forward()
 
 

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jvr.fitting.fit import FitResult
 from jvr.fitting.identifiability import TINY
 from jvr.fitting.losses import SquaredError
 from jvr.fitting.normal_equations import light_tangents, normal_equations
 from jvr.fitting.observations import is_mostly_empty, observe
 from jvr.fitting.problem import Problem
+from jvr.fitting.result import FitResult
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns, leaves_by_name
 from jvr.model.camera import AbstractCamera
 from jvr.rendering.settings import Settings
@@ -37,15 +37,16 @@ def next_view(result: FitResult, candidates: Sequence[AbstractCamera], settings:
     """Ranks views that could be taken by what they would add to a fit, the best first.
 
     With the information `F` of a fit, `sum J^T J / s^2` over its pixels with the residual variance `s^2`, a view adds the same sum over its
-    own pixels: their rows `J` at the fitted values need no picture. Views are compared by the determinant (D-optimality: Chaloner and
+    own pixels: their rows `J` at the fitted values need no picture. What is not known of the fit's own cameras a candidate, whose camera is
+    known, says nothing of: they are eliminated first. Views are compared by the determinant (D-optimality: Chaloner and
     Verdinelli 1995), which no choice of units changes. What the fit leaves open counts as uncertain by as much as it may plausibly be: the
     width of a range, else a value's own size (`jvr.fitting.unknowns.Unknowns.plausible`). Gains of several views do not add up: take the
     first, fit again, ask again.
 
     **Arguments:** `result`: of `jvr.fit`, of a table or other few unknowns; `candidates`: cameras of any kind and size;
     `settings`: those of the fit.
-    **Raises** `ValueError` for a fit that has no information matrix (voxels), without candidates, and for a candidate that does
-    not see the volume.
+    **Raises** `ValueError` for a fit that has no information matrix (voxels) or has found cameras alone, without candidates, and for a
+    candidate that does not see the volume.
     """
     if result.information is None:
         raise ValueError(
@@ -53,6 +54,8 @@ def next_view(result: FitResult, candidates: Sequence[AbstractCamera], settings:
         )
     if not candidates:
         raise ValueError("there are no candidates: give cameras that could be taken, such as jvr.orbit(...)")
+    result = _about_the_scene(result)
+    assert result.information is not None
     problem, values = _problem(result, len(result.information), settings)
     size = problem.unknowns.plausible(problem.model, np.asarray(values, np.float64))
     # In units of what is plausible, so that the small matrix is well scaled.
@@ -71,6 +74,28 @@ def next_view(result: FitResult, candidates: Sequence[AbstractCamera], settings:
         }
         found.append(Candidate(i, camera, float(gain), {name: shaped[name] for name in result.unknowns}))
     return tuple(sorted(found, key=lambda candidate: -candidate.gain))
+
+
+def _about_the_scene(result: FitResult) -> FitResult:
+    """The result without the cameras that were found: the information about the rest is the Schur complement, with a camera's values
+    uncertain by one of their unit where the fit leaves them open."""
+    assert result.information is not None
+    is_camera = ["cameras" in name for name in result.unknowns]
+    if all(is_camera):
+        raise ValueError(
+            "the fit has found cameras alone, of which another view says nothing: give it unknowns of the scene as well"
+        )
+    if not any(is_camera):
+        return result
+    sizes = [errors.size for errors in result.errors_by_name.values()]
+    camera = np.repeat(is_camera, sizes)
+    # The exposure comes last.
+    camera = np.append(camera, np.zeros(len(result.information) - camera.size, bool))
+    whole = result.information
+    own, crossed = whole[np.ix_(camera, camera)], whole[np.ix_(camera, ~camera)]
+    rest = whole[np.ix_(~camera, ~camera)] - crossed.T @ np.linalg.solve(own + np.eye(len(own)), crossed)
+    names = tuple(name for name, found in zip(result.unknowns, is_camera, strict=True) if not found)
+    return result._replace(information=rest, unknowns=names)
 
 
 def _problem(result: FitResult, count: int, settings: Settings) -> tuple[Problem, jax.Array]:

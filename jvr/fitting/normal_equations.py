@@ -12,23 +12,43 @@ from jaxtyping import Array, Float, Int
 
 from jvr.execution.devices import everywhere, over_rays
 from jvr.fitting.identifiability import Scores
-from jvr.fitting.kinds import Kinds, TableEntries
+from jvr.fitting.kinds import Kinds, OfViews, TableEntries
 from jvr.fitting.objective import seen
-from jvr.fitting.observations import Observations, inside, observed_medium, prepare_in_fit
+from jvr.fitting.observations import Observations, observed_medium, prepare_in_fit, rays_inside
 from jvr.fitting.problem import Problem, predict, prior
 from jvr.fitting.unknowns import ExposedModel
+from jvr.fitting.views import Pixels
 from jvr.march.differentiation import Forward
 from jvr.march.jacobian import TableJacobian, table_jacobian
 from jvr.march.march import Marched, MarchOptions
 from jvr.march.medium import Medium
+from jvr.march.ray_jacobian import ray_jacobian
+from jvr.march.steps import Rays
 from jvr.model.scene import Scene
 from jvr.rendering.medium import Prepared
 from jvr.types import Triple
 
 
+class _OfViews(eqx.Module):
+    """Rows for unknown cameras: for each ray its view and its derivatives in the directions of that view, whose unknowns are in `columns`
+    (`jvr.fitting.kinds.OfViews`)."""
+
+    view: Int[Array, "rays"]
+    rows: Float[Array, "rays directions"]
+    columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    @property
+    def places(self) -> np.ndarray:
+        return np.asarray(self.columns, np.int32)
+
+    def by_view(self, of_rays: Float[Array, "rays *n"]) -> Float[Array, "views *n"]:
+        """Sums over the rays of each view."""
+        return jax.ops.segment_sum(of_rays, self.view, num_segments=len(self.columns))
+
+
 class _Channel(eqx.Module):
     """One colour channel of a tile: for each ray its block of pixels, its colour, `r`, `w` and `w rho(r)` of `Normal`, and its row for the
-    unknowns in `columns`."""
+    unknowns in `columns`, and for those of its own view where cameras are unknown."""
 
     block: Int[Array, "rays"]
     colour: Float[Array, "rays"]
@@ -37,6 +57,7 @@ class _Channel(eqx.Module):
     loss: Float[Array, "rays"]
     rows: Float[Array, "rays columns"]
     columns: tuple[int, ...] = eqx.field(static=True)
+    of_views: _OfViews | None = None
 
 
 class Normal(NamedTuple):
@@ -152,15 +173,16 @@ def _channels(
 def _share_of_channels(
     problem: Problem, values: Float[Array, "unknowns"], tile: Observations, around: LightTangents | None
 ) -> list[_Channel]:
-    colours, blocks = _jacobian(problem, values, tile, around)
+    colours, blocks, of_views = _jacobian(problem, values, tile, around)
     channels = []
     for c, colour in enumerate(colours):
         r = colour - tile.target[:, c]
-        rows = jnp.concatenate([block for block, _ in blocks[c]], axis=1)
-        columns = tuple(np.concatenate([columns for _, columns in blocks[c]]).tolist())
+        nothing: Blocks = [] if blocks[c] else [(jnp.zeros((r.size, 0), r.dtype), np.zeros(0, int))]
+        rows = jnp.concatenate([block for block, _ in (*blocks[c], *nothing)], axis=1)
+        columns = tuple(np.concatenate([columns for _, columns in (*blocks[c], *nothing)]).tolist())
         losses = tile.weight * problem.loss.value(r)
         weight = tile.weight * problem.loss.weight(r)
-        channels.append(_Channel(tile.block, colour, r, weight, losses, rows, columns))
+        channels.append(_Channel(tile.block, colour, r, weight, losses, rows, columns, of_views[c]))
     return channels
 
 
@@ -177,7 +199,33 @@ def _sums(channels: list[_Channel], n: int) -> Normal:
             total.matrix.at[columns[:, None], columns].add(weighted.T @ rows),
             total.vector.at[columns].add(weighted.T @ r),
         )
+        if channel.of_views is not None:
+            of_views = _in_double(channel.of_views)
+            matrix, vector = _sums_of_views(of_views, rows, columns, weight, r, n)
+            total = total._replace(matrix=total.matrix + matrix, vector=total.vector + vector)
     return everywhere(total)
+
+
+def _in_double(of_views: _OfViews) -> _OfViews:
+    return eqx.tree_at(lambda x: x.rows, of_views, of_views.rows.astype(float))
+
+
+def _sums_of_views(
+    of_views: _OfViews, rows: Array, columns: np.ndarray, weight: Array, r: Array, n: int
+) -> tuple[Float[Array, "n n"], Float[Array, "n"]]:
+    """The part of the normal equations that unknown cameras have: a block for each view, and one of each view with all other unknowns. A
+    row of all views, zero but for one of them, is never held."""
+    own, places = of_views.rows, of_views.places
+    weighted = own * weight[:, None]
+    blocks = of_views.by_view(own[:, :, None] * weighted[:, None, :])
+    matrix = jnp.zeros((n, n)).at[places[:, :, None], places[:, None, :]].add(blocks, mode="drop")
+    vector = jnp.zeros(n).at[places].add(of_views.by_view(weighted * r[:, None]), mode="drop")
+    if columns.size:
+        # One direction after the other: their products with the rows of all are as many times as large as these.
+        across = jax.lax.map(lambda x: of_views.by_view(rows * x[:, None]), weighted.T)
+        crossed = jnp.zeros((n, n)).at[places.T[:, :, None], columns].add(across, mode="drop")
+        matrix += crossed + crossed.T
+    return matrix, vector
 
 
 @eqx.filter_jit
@@ -189,8 +237,18 @@ def _scores(channels: list[_Channel], n: int, blocks: int) -> Scores:
         columns, by_block = np.asarray(channel.columns, np.int32), partial(jax.ops.segment_sum, num_segments=blocks)
         score = score.at[:, columns].add(by_block(rows * (weight * r)[:, None], channel.block))
         # What sees no unknown, as the empty background, says nothing of how well they explain the rest.
-        live = jnp.where(jnp.any(rows != 0, axis=1), weight, 0)
+        seen = jnp.any(rows != 0, axis=1)
         moved = lambda by, rows=rows, columns=columns: jnp.zeros(n).at[columns].add(by @ rows)
+        if channel.of_views is not None:
+            of_views = _in_double(channel.of_views)
+            seen |= jnp.any(of_views.rows != 0, axis=1)
+            score = score.at[_places_of_blocks(of_views, channel.block, blocks)].add(
+                by_block(of_views.rows * (weight * r)[:, None], channel.block), mode="drop"
+            )
+            moved = lambda by, moved=moved, of_views=of_views: (
+                moved(by).at[of_views.places].add(of_views.by_view(of_views.rows * by[:, None]), mode="drop")
+            )
+        live = jnp.where(seen, weight, 0)
         sums = live, live * r**2, live * colour**2, (live * r) ** 2
         by_channel.append(
             (by_block(live * r, channel.block), moved(weight), moved(weight * colour), jnp.stack([jnp.sum(x) for x in sums]))
@@ -199,10 +257,17 @@ def _scores(channels: list[_Channel], n: int, blocks: int) -> Scores:
     return everywhere(Scores(score, residual, offset, gain, sums))
 
 
+def _places_of_blocks(of_views: _OfViews, block: Int[Array, "rays"], blocks: int) -> tuple[Array, Array]:
+    """Where in a table of blocks and unknowns the sums over blocks of a view's rows belong: the pixels of a block are of one view."""
+    view = jnp.maximum(jax.ops.segment_max(of_views.view, block, num_segments=blocks), 0)
+    return jnp.arange(blocks)[:, None], jnp.asarray(of_views.places)[view]
+
+
 def _jacobian(
     problem: Problem, values: Float[Array, "unknowns"], tile: Observations, around: LightTangents | None
-) -> tuple[Triple, list[Blocks]]:
-    """Predicted colours of a chunk, and for each channel blocks of its Jacobian with the unknowns that they belong to."""
+) -> tuple[Triple, list[Blocks], list[_OfViews | None]]:
+    """Predicted colours of a chunk, and for each channel blocks of its Jacobian with the unknowns that they belong to, and the rows of
+    unknown cameras."""
     kinds = Kinds.of(problem)
     model = kinds.changed(values[kinds.inner], values)
     options = MarchOptions(problem.settings.termination, distance=False)
@@ -217,9 +282,14 @@ def _jacobian(
     def look(part: Array, arrays: Any) -> tuple[Triple, Marched | None]:
         changed = kinds.changed(part, values)
         prepared, through = observed(changed.scene, arrays)
-        return seen(problem, changed, inside(changed.scene, tile.rays), through, prepared, Forward())
+        rays = rays_inside(changed.scene, changed.views, tile.rays)
+        return seen(problem, changed, rays, through, prepared, Forward())
 
-    rays, gathered, colours = inside(model.scene, tile.rays), None, ()
+    rays, gathered, colours = rays_inside(model.scene, model.views, tile.rays), None, ()
+    of_views: list[_OfViews | None] = [None, None, None]
+    if kinds.of_views is not None:
+        prepared, through = observed(model.scene, arrays)
+        gathered, of_views, colours = _rows_of_views(problem, model, kinds.of_views, tile, (prepared, through, rays))
     if any(indices is not None for indices in kinds.entries):
         prepared, through = observed(model.scene, arrays)
         assert through is not None
@@ -235,13 +305,46 @@ def _jacobian(
     if gathered is None and not colours:
         colours, gathered = look(values[kinds.inner], arrays)
     if gathered is None:
-        return colours, blocks
+        return colours, blocks, of_views
     if kinds.outer.size:
         after = lambda part: predict(kinds.changed(part, values, kinds.outer), gathered, rays.length)
         of_outer = jax.jacfwd(after)(values[kinds.outer])
         for c in range(3):
             blocks[c].append((of_outer[c], kinds.outer))
-    return predict(model, gathered, rays.length), blocks
+    return predict(model, gathered, rays.length), blocks, of_views
+
+
+def _rows_of_views(
+    problem: Problem,
+    model: ExposedModel,
+    of_views: OfViews,
+    tile: Observations,
+    marched: tuple[Prepared, Medium | None, Rays],
+) -> tuple[Marched | None, list[_OfViews | None], Triple]:
+    """What a march has gathered, the rows of unknown cameras in each channel, and where nothing marches, the colours.
+
+    A camera acts through where its rays run alone, so a march is differentiated in these, once for all directions.
+    """
+    prepared, through, rays = marched
+    assert isinstance(tile.rays, Pixels)
+    basis = of_views.basis(rays.length.dtype)
+    still, (view, _) = jax.tree.map(lambda x: jnp.zeros_like(x[0]), basis), tile.rays
+    move = lambda shift: rays_inside(model.scene, model.views, tile.rays, shift)
+    if through is None:
+        look = lambda shift: seen(problem, model, move(shift), None, prepared, Forward())[0]
+        colours, jacobian = jax.vmap(lambda t: jax.jvp(look, (still,), (t,)), out_axes=(None, 0))(basis)
+        gathered, found = None, [channel.T for channel in jacobian]
+    else:
+        options = MarchOptions(problem.settings.termination, distance=False)
+        final = lambda gathered: predict(model, gathered, rays.length)
+        gathered, of_rays = ray_jacobian(options, through, rays, prepared.dt, final)
+        along = jax.vmap(lambda t: jax.jvp(move, (still,), (t,))[1])(basis)
+        colours = ()
+        chained = lambda of: jax.tree.reduce(jnp.add, jax.tree.map(jnp.multiply, of, along))
+        found = [chained(of).T for of in of_rays]
+    columns = tuple(map(tuple, of_views.columns.tolist()))
+    known = jnp.asarray(of_views.columns == sum(v.size for v in problem.unknowns.values(problem.model)))[view]
+    return gathered, [_OfViews(view, jnp.where(known, 0, rows), columns) for rows in found], colours
 
 
 def _add_entries(

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from jvr.execution.devices import everywhere, over_rays, shares
 from jvr.execution.tiles import dealt_blocks, picture_of, pixels_of
 from jvr.fitting.kinds import adjoint_of
-from jvr.fitting.observations import Observations, inside, observed_medium, prepare_in_fit
+from jvr.fitting.observations import Observations, observed_medium, prepare_in_fit, rays_inside
 from jvr.fitting.problem import Problem, exposed, predict, prior
 from jvr.fitting.unknowns import ExposedModel
 from jvr.march.differentiation import AbstractAdjoint, Replay
@@ -72,7 +72,8 @@ def residual(
 ) -> Triple:
     """Rendered minus target in each channel, differentiable in the mode of `adjoint`."""
     through = observed_medium(tile, problem.samples, prepared) if problem.integrator.marches else None
-    colours, _ = seen(problem, model, inside(model.scene, tile.rays), through, prepared, adjoint)
+    rays = rays_inside(model.scene, model.views, tile.rays)
+    colours, _ = seen(problem, model, rays, through, prepared, adjoint)
     return tuple(c - tile.target[:, i] for i, c in enumerate(colours))
 
 

@@ -2,7 +2,7 @@
 
 import functools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int, UInt16
 
 from jvr.execution.devices import everywhere, on_devices, over_rays, shares
 from jvr.fitting.targets import check_weights
+from jvr.fitting.views import Pixels, Shift, Views
 from jvr.march.fields import MISSING, CachedSamples, VoxelField
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
@@ -44,14 +45,15 @@ class WorldRays(NamedTuple):
 
 
 class Observations(eqx.Module):
-    """World rays with the colour that each should have, `(tiles, rays)`: as many tiles for each device, its share; in each share, rays
-    that cross more of the volume come first. A fit holds them once, and takes its tiles out of them within its programs.
+    """World rays, or pixels of cameras that are unknown, with the colour that each should have, `(tiles, rays)`: as many tiles for each
+    device, its share; in each share, rays that cross more of the volume come first. A fit holds them once, and takes its tiles out of
+    them within its programs.
 
     `weight` is 0 for the rays that fill up a share. `block` numbers the squares of neighbouring pixels. `start` is where a ray's kept
     samples begin in what its device holds, all 0 without any.
     """
 
-    rays: WorldRays
+    rays: WorldRays | Pixels
     target: Float[Array, "*tiles rays 3"]
     weight: Float[Array, "*tiles rays"]
     block: Int[Array, "*tiles rays"]
@@ -116,20 +118,29 @@ def observe(
     weights: Sequence[Any] | None,
     settings: Settings,
     chunk: int | None = None,
+    *,
+    unknown: Collection[int] = (),
+    among: Sequence[np.ndarray] | None = None,
 ) -> Observations:
     """All pixels of all images as observations, in tiles of at most `chunk` rays, `CHUNK` without it. Sorted by how much of the volume they
     cross, rays are dealt out in turn to the devices.
 
-    **Raises** `ValueError` for settings that fits do not support, and where no ray meets the volume.
+    `unknown`: the cameras that a fit finds; where there are any, rays are pixels. `among`: which pixels are taken, one mask for each image.
+
+    **Raises** `ValueError` for settings that fits do not support, where no ray meets the volume, or none of an unknown camera.
     """
     check_settings(settings)
     weights = check_weights(cameras, weights, images[0].dtype)
     # Compiled for all cameras of one size and kind.
-    rays = [_rays(scene, camera) for camera in cameras]
+    rays: list[Any] = [_rays(scene, camera) for camera in cameras]
     lengths = [np.asarray(inside(scene, one).length) for one in rays]
-    _check_views(lengths, scene)
+    _check_views(lengths, scene, unknown)
     length = np.concatenate(lengths)
     order = np.argsort(-length, kind="stable").astype(np.int32)
+    if among is not None:
+        order = order[np.concatenate([np.ravel(mask) for mask in among])[order]]
+    if unknown:
+        rays = [_pixels(i, camera) for i, camera in enumerate(cameras)]
     chunk = min(chunk or CHUNK, -(-order.size // shares()))
     together = chunk * shares()
     rank = np.arange(-(-order.size // together) * together, dtype=np.int32).reshape(-1, shares()).T.reshape(-1, chunk)
@@ -170,6 +181,19 @@ def _rays(scene: Scene, camera: AbstractCamera) -> WorldRays:
     origin, direction, behind = camera.rays_ahead(pixels, ahead(scene, camera))
     starts = [two_sum(zero.high[i], zero.low[i], x) for i, x in enumerate(origin)]
     return WorldRays(tuple(high for high, _ in starts), tuple(low for _, low in starts), direction, behind)
+
+
+def _pixels(view: int, camera: AbstractCamera) -> Pixels:
+    count = camera.width * camera.height
+    return Pixels(np.full(count, view, np.int32), np.arange(count, dtype=np.int32))  # pyright: ignore[reportArgumentType]
+
+
+def rays_inside(scene: Scene, views: Views | None, rays: WorldRays | Pixels, shift: Shift | None = None) -> Rays:
+    """The rays of a tile inside of the volume; of cameras that are unknown as they are now, and with a `shift` of their values."""
+    if isinstance(rays, WorldRays):
+        return inside(scene, rays)
+    assert views is not None
+    return views.rays(scene, rays, shift)
 
 
 @jax.jit
@@ -239,13 +263,19 @@ def observed_medium(tile: Observations, samples: Samples | None, prepared: Prepa
     return through if samples is None else through._replace(field=samples.along(tile.start))
 
 
-def _check_views(lengths: Sequence[np.ndarray], scene: Scene) -> None:
-    """**Raises** `ValueError` where no ray of any camera meets the volume; a camera whose rays all miss it is named."""
+def _check_views(lengths: Sequence[np.ndarray], scene: Scene, unknown: Collection[int]) -> None:
+    """**Raises** `ValueError` where no ray of any camera meets the volume, or none of an unknown one; a camera whose rays all miss it is
+    named."""
     blind = [i for i, length in enumerate(lengths) if not np.any(length > 0)]
     center = ", ".join(f"{c:.4g}" for c in np.asarray(scene.volume.center))
     where = f"the volume is around ({center}), with a radius of {float(scene.volume.radius):.4g}: check their poses, and clipping"
     if len(blind) == len(lengths):
         raise ValueError(f"no camera sees the volume; {where}")
+    if lost := [i for i in blind if i in unknown]:
+        raise ValueError(
+            f"camera {lost[0]} is unknown and sees nothing of the volume, so that nothing pulls it there: start it where its picture shows "
+            f"the volume, such as by look_at its centre, or leave it out; {where}"
+        )
     if blind:
         named = ", ".join(map(str, blind))
         warnings.warn(
@@ -259,7 +289,7 @@ def _segments(scene: Scene, observations: Observations, dt: Scalar) -> Int[Array
 
     def share(shared: tuple[Scene, Scalar], observations: Observations) -> Int[Array, "tiles"]:
         scene, dt = shared
-        return jax.vmap(lambda rays: jnp.max(segment_count(inside(scene, rays).length, dt)))(observations.rays)
+        return jax.vmap(lambda rays: jnp.max(segment_count(rays_inside(scene, None, rays).length, dt)))(observations.rays)
 
     return everywhere(over_rays(share, (scene, dt), observations))
 
@@ -279,7 +309,7 @@ def _resample(
     def share(shared: Any, own: tuple[Array, Observations]) -> Array:
         scene, (index, begin, count), dt, low, scale = shared
         stored, observations = own
-        rays = inside(scene, observations.tile(index).rays)
+        rays = rays_inside(scene, None, observations.tile(index).rays)
 
         def one(k: Int[Array, ""], stored: Array) -> Array:
             _, u = segment_span(k, segment_count(rays.length, dt), rays.length, dt)

@@ -14,12 +14,12 @@ from scipy.sparse.linalg import LinearOperator, cg
 from jvr.execution.devices import everywhere, on_devices, over_rays
 from jvr.fitting.continuation import UNDETERMINED
 from jvr.fitting.evaluator import Evaluator
-from jvr.fitting.fit import FitResult
 from jvr.fitting.losses import AbstractPrior, SquaredError
 from jvr.fitting.objective import residual
 from jvr.fitting.observations import Observations, observe, prepare_in_fit
 from jvr.fitting.problem import Problem, prior
 from jvr.fitting.reach import known_background
+from jvr.fitting.result import FitResult
 from jvr.fitting.targets import targets_of
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 from jvr.model.camera import AbstractCamera

@@ -219,7 +219,7 @@ def test_an_interrupted_fit_on_grids_goes_on(tmp_path):
     ("change", "keywords", "message"),
     [
         (lambda s: s, {"levels": 6}, "levels must be from 1 to 5 for 17 x 17 x 17 voxels, not 6"),
-        (lambda s: s, {"unknowns": lambda s: s.transfer.rgb}, "transfer.rgb are asked for: name volume.values"),
+        (lambda s: s, {"unknowns": lambda s: s.transfer.rgb}, "which are not asked for: name volume.values"),
         (lambda s: eqx.tree_at(lambda s: s.volume, s, s.volume.packed()), {}, "holds integers .*values=volume.values.astype"),
         (
             lambda s: eqx.tree_at(lambda s: s.volume, s, jvr.Volume(np.where(bump(7) > 0.5, np.nan, 0.0))),

@@ -1,12 +1,9 @@
 """From checked tables to the objects of `jvr`: the one place where a name becomes an object."""
 
-import difflib
-import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,6 +18,7 @@ from jvr.io.config.schema.transfer import TransferTable
 from jvr.io.config.schema.whole import FitTable, VolumeTable
 from jvr.io.config.targets import held_out_indices, views_in_files
 from jvr.io.config.transfers import build_transfer
+from jvr.io.config.unknowns import unknowns_of
 from jvr.model.camera import AbstractCamera, PerspectiveCamera, fibonacci_sphere
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTransfer, LutTransfer
@@ -124,13 +122,13 @@ def build_fit(
         raise ConfigError(config.name, "fit", "missing; add a table [fit] that says what to find")
     volume, settings = build_volume(config), build_settings(config)
     cameras = build_cameras(config, volume)
-    scene = _scene(started(config), start_voxels(fit, volume), _start_transfer(config, fit, volume))
-    keywords = {**_keywords(config, fit), "unknowns": _unknowns(config, fit, scene), "settings": settings}
-    keywords["transforms"], levels = transforms_of(fit, scene.volume), 1 if fit.voxels is None else fit.voxels.levels
-    scene = fit_scene(config, scene, precompute)
+    begun = started(config)
+    scene = _scene(begun, start_voxels(fit, volume), _start_transfer(config, fit, volume))
+    levels = 1 if fit.voxels is None else fit.voxels.levels
+    scene, first = fit_scene(config, scene, precompute), scene
     if tables.truth is None:
-        inside, outside = views_in_files(config, fit, cameras, read_image)
-        keywords["weights"] = inside.weights
+        inside, outside = views_in_files(config, fit, build_cameras(begun, volume), read_image)
+        keywords = _all_keywords(config, fit, first, inside.cameras) | {"weights": inside.weights}
         held_out = (outside.cameras, outside.images) if outside.cameras else None
         return FitJob(scene, inside.cameras, inside.images, None, held_out, keywords, keeps_radiance_transfer(config), levels)
     truth = _transfer(config, tables.truth, volume, "truth")
@@ -139,8 +137,12 @@ def build_fit(
     extra = _extra_cameras(config, fit, cameras, volume)
     inside, outside = ([c for c, out in extra if out == which] for which in (False, True))
     held_out = (tuple(outside), tuple(map(picture, outside))) if outside else None
+    # Where the fit believes them to be.
+    believed = _extra_cameras(begun, fit, build_cameras(begun, volume), volume)
+    start = tuple(camera for camera, out in believed if not out)
+    keywords = _all_keywords(config, fit, first, start)
     keeps, images = keeps_radiance_transfer(config), tuple(map(picture, inside))
-    return FitJob(scene, tuple(inside), images, truth, held_out, keywords, keeps, levels)
+    return FitJob(scene, start, images, truth, held_out, keywords, keeps, levels)
 
 
 def _builtin() -> Volume:
@@ -205,6 +207,16 @@ def _start(config: Config, volume: Volume) -> AbstractTransfer:
         return LutTransfer(np.full((start.entries, 3), start.grey), np.full(start.entries, sigma_t), start.domain)
 
 
+def _all_keywords(config: Config, fit: FitTable, scene: Scene, cameras: tuple[AbstractCamera, ...]) -> dict[str, Any]:
+    """Keywords of `jvr.fit` for a scene before anything was computed for it."""
+    keywords = {
+        **_keywords(config, fit),
+        "unknowns": unknowns_of(config, fit, scene, cameras),
+        "settings": build_settings(config),
+    }
+    return keywords | {"transforms": transforms_of(fit, scene.volume)}
+
+
 def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:
     from jvr.fitting.losses import DSSIM, AbsoluteError, Huber, SquaredError
 
@@ -221,6 +233,7 @@ def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:
         "exposure": fit.exposure,
         "keep_samples": fit.keep_samples,
         "smooth_undetermined": fit.smooth_undetermined,
+        "coarse_levels": fit.coarse_levels,
         "max_steps": fit.max_steps,
     }
 
@@ -242,32 +255,6 @@ def _solver(fit: FitTable) -> Any:
         return optx.OptaxMinimiser(optax.adam(fit.learning_rate), rtol=rtol, atol=rtol)
     quasi_newton = {"bfgs": optx.BFGS, "lbfgs": optx.LBFGS}[fit.solver]
     return quasi_newton(rtol=rtol, atol=1e-2 * rtol)
-
-
-def _unknowns(config: Config, fit: FitTable, scene: Scene) -> Callable[[Scene], Any]:
-    """Picks the arrays of a scene that `fit.unknowns` names."""
-    arrays = {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(scene)}
-    wanted = [re.sub(r"\.(\d+)(?=\.|$)", r"[\1]", name) for name in fit.unknowns]
-    fittable = [name for name, leaf in arrays.items() if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    for i, name in enumerate(wanted):
-        if name in fittable:
-            continue
-        near = difflib.get_close_matches(name, fittable, 1, 0.6)
-        hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(fittable)}"
-        problem, key = "is not an array of the scene", f"fit.unknowns[{i}]"
-        if name in arrays:
-            problem, hint = (
-                "holds integers, which have no derivative",
-                "volume.scale = [low, high] makes voxels floating-point numbers",
-            )
-        raise ConfigError(config.where(key), key, f"'{name}' {problem}; {hint}")
-
-    def select(scene: Scene) -> Any:
-        found = dict(jax.tree_util.tree_leaves_with_path(scene))
-        named = {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in found.items()}
-        return tuple(named[name] for name in wanted)
-
-    return select
 
 
 def _extra_cameras(

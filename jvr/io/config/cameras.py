@@ -1,18 +1,23 @@
 """Cameras from their tables."""
 
 import itertools
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jvr.atomic import replacing
 from jvr.io.config.schema.whole import RigTable, SingleTable
+from jvr.io.config.text import toml_of
+from jvr.io.kinds import KINDS
 from jvr.march.occupancy import visible_bricks
 from jvr.model.bricks import bricks_of
 from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, look_at
 from jvr.model.exact import in_double
+from jvr.model.parameters import declared
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
 from jvr.model.voxels import VOXEL
@@ -29,6 +34,7 @@ VIEWS = {
 }
 # One voxel makes up to eight bricks visible. Groups of so many are specks where they are at most this share of all.
 SPECK, SPECKS = 8, 0.05
+HEADER = '# Cameras of jvr, positions in mm: camera = "FILE" in a configuration, or --set camera=FILE.\n'
 # How much larger than what it shows a picture is.
 MARGIN = 1.05
 # Of a camera that does not say it: pixels, and degrees.
@@ -52,6 +58,28 @@ def cameras_of(
     if isinstance(table, RigTable):
         return _rig(table, center, float(np.max(np.linalg.norm(corners - center, axis=1))))
     return (_single(table, center, corners),)
+
+
+def write_cameras(path: str | os.PathLike, cameras: Sequence[AbstractCamera]) -> None:
+    """Writes cameras as tables `[[camera]]` of a configuration, positions in double precision; the file is replaced at once or not at all.
+
+    **Raises** `TypeError` for a kind of camera that has no form in TOML.
+    """
+    tables = [_table_of(camera) for camera in cameras]
+    with replacing(path) as temporary:
+        temporary.write_text(HEADER + toml_of({"camera": tables}), encoding="utf-8")
+
+
+def _table_of(camera: AbstractCamera) -> dict[str, Any]:
+    kind = next((kind for kind, name in KINDS[AbstractCamera].items() if name == type(camera).__name__), None)
+    if kind is None:
+        raise TypeError(f"{type(camera).__name__} cannot be written as TOML")
+    pose = in_double(camera.world_from_camera, camera.remainder)
+    back, eye = pose[:3, 2], pose[:3, 3]
+    lens = {name: getattr(camera, name) for name in declared(type(camera)) if name not in ("world_from_camera", "remainder")}
+    # As far away as what it looks at, so that both keep their digits.
+    place = {"eye": eye, "target": eye - max(float(np.linalg.norm(eye)), 1.0) * back, "up": pose[:3, 1]}
+    return {"kind": kind, **place, **{n: v if isinstance(v, int) else np.asarray(v) for n, v in lens.items()}}
 
 
 def _single(table: SingleTable, center: np.ndarray, corners: np.ndarray) -> AbstractCamera:

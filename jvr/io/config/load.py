@@ -16,7 +16,7 @@ from jvr.io.config.text import read_toml
 
 Override = tuple[str, Any]
 # Tables whose values may be others where a fit starts.
-INITIAL = ("lights", "shading", "scattering", "background", "environment", "material", "radiance_transfer")
+INITIAL = ("camera", "lights", "shading", "scattering", "background", "environment", "material", "radiance_transfer")
 # Keys of one table that exclude each other.
 ALTERNATIVES = {"path": "builtin", "fov_y": "half_angle_tangent", "opacity": "sigma_t"}
 ALTERNATIVES |= {b: a for a, b in ALTERNATIVES.items()}
@@ -82,6 +82,7 @@ def config_from(data: dict[str, Any], name: str, folder: Path = Path(), override
         key, value = _parse(text)
         _put(data, key, value)
         keys.append(key)
+    data = _with_cameras(data, name, folder, tuple(keys))
     try:
         return Config(ConfigTable.model_validate(data), name, folder, tuple(keys), overrides=tuple(overrides), data=data)
     except ValidationError as error:
@@ -91,10 +92,26 @@ def config_from(data: dict[str, Any], name: str, folder: Path = Path(), override
         raise ConfigError("--set" if misspelt else _where(name, tuple(keys), key), key, problem) from None
 
 
+def _with_cameras(data: dict[str, Any], name: str, folder: Path, keys: tuple[str, ...]) -> dict[str, Any]:
+    """Tables with those of the file that `camera` names in its place, as a fit writes one; other words are kinds of cameras."""
+    given = data.get("camera")
+    if not isinstance(given, str) or not given.endswith(".toml"):
+        return data
+    where = _where(name, keys, "camera")
+    folders = [Path(), folder] if where == "--set" else [folder]
+    found = next((place / given for place in folders if (place / given).is_file()), None)
+    if found is None:
+        raise ConfigError(where, "camera", f"'{given}' does not exist; a file of tables [[camera]] is meant, as a fit writes one")
+    _, tables = read_toml(found)
+    if set(tables) != {"camera"}:
+        raise ConfigError(str(found), "", "a file of cameras has tables [[camera]] and nothing else")
+    return {**data, "camera": tables["camera"]}
+
+
 def started(config: Config) -> Config:
     """The configuration with the values of `fit.initial` in place of its own.
 
-    **Raises** `ConfigError` for keys that say nothing about light, and for values that are refused there.
+    **Raises** `ConfigError` for keys that say nothing about cameras and light, and for values that are refused there.
     """
     fit = config.tables.fit
     if fit is None or not fit.initial:

@@ -15,12 +15,12 @@ from jvr.atomic import replacing
 from jvr.model.transfer import AbstractTransfer
 from jvr.report.errors import field_errors
 from jvr.report.page.summary import identifiability, summary, verdict
-from jvr.report.page.values import other_values, transfer_values
+from jvr.report.page.values import camera_values, other_values, transfer_values
 from jvr.report.plots import comparison_strip, plot_convergence, plot_transfer, png
 from jvr.report.plots.pictures import MOST_VIEWS, check_pairs
 
 if TYPE_CHECKING:
-    from jvr.fitting.fit import FitResult
+    from jvr.fitting.result import FitResult
 
 PACKAGES = ("jvr", "jax", "jaxlib", "equinox", "optimistix", "numpy")
 
@@ -91,6 +91,7 @@ def write_fit_page(
         *([] if transfer.takes_gradient else [_transfer(transfer, errors, truth, histogram, _reached_by_light(transfer))]),
         *([] if transfer.takes_gradient else [transfer_values(transfer, errors)]),
         other_values(result.scene, result.errors_by_name),
+        camera_values(result.cameras, result.errors_by_name),
         identifiability(result, transfer),
         _convergence(result),
         _again(command, config_text, versions),

@@ -12,7 +12,7 @@ from jvr.report.plots.pictures import decibels
 from jvr.types import Outcome
 
 if TYPE_CHECKING:
-    from jvr.fitting.fit import FitResult, FitStats
+    from jvr.fitting.result import FitResult, FitStats
 
 
 def verdict(result: "FitResult", targets: Sequence[Any], fitted: Sequence[Any]) -> str:

@@ -1,13 +1,16 @@
 """Tables of the fitted values with their standard errors."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
+from jvr.fitting.result import POSE
 from jvr.fitting.unknowns import leaves_by_name
+from jvr.model.camera import AbstractCamera
 from jvr.model.transfer import AbstractTransfer, GaussianTransfer
 from jvr.pictures import srgb_from_linear
 from jvr.report.page.words import COLOURS, TITLES, entries_in_words, with_error
@@ -103,3 +106,29 @@ def other_values(scene: Any, errors: Mapping[str, np.ndarray]) -> str:
             )
         rows.append(f"<tr><th>{escape(name)}</th><td>{text}</td></tr>")
     return f'<h2>Other fitted values</h2><div class="scroll"><table>{"".join(rows)}</table></div>' if rows else ""
+
+
+def camera_values(cameras: Sequence[AbstractCamera], errors: Mapping[str, np.ndarray]) -> str:
+    """What was fitted of cameras: poses by their standard errors, other values as they are."""
+    rows = []
+    for name, error in errors.items():
+        if "cameras" not in name:
+            continue
+        cells = (
+            [_error(e, unit) for e, unit in zip(error.tolist(), ["°"] * 3 + [" mm"] * 3, strict=True)] if POSE in name else None
+        )
+        if cells is None:
+            view = re.search(r"\[(\d+)\]", name)
+            field = name.rstrip(")").rpartition(".")[2]
+            value = np.ravel(np.asarray(getattr(cameras[int(view[1]) if view else 0], field)))
+            cells = [_cell(v, e) for v, e in zip(value.tolist(), np.ravel(error).tolist(), strict=True)]
+        rows.append(f"<tr><th>{escape(name)}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
+    if not rows:
+        return ""
+    note = "Of a pose the standard errors: rotations about the centre of the volume and translations of it, along x, y and z of the world."
+    table = f'<div class="scroll"><table>{"".join(rows)}</table></div>'
+    return f'<h2>Cameras</h2><p class="soft">{note}</p>{table}'
+
+
+def _error(error: float, unit: str) -> str:
+    return f"± {error:.2g}{unit}" if np.isfinite(error) else '<span class="unknown">not determined</span>'

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from jvr.fitting.fit import Iteration
+    from jvr.fitting.result import Iteration
 
 
 def plot_convergence(history: Sequence["Iteration"]) -> "Figure":

@@ -202,6 +202,7 @@ class FitTable(Table):
     exposure: bool = False
     keep_samples: Annotated[bool | int, BeforeValidator(_keep)] = True
     smooth_undetermined: bool = True
+    coarse_levels: Annotated[int, whole("levels of blurred pictures to begin with", NOT_NEGATIVE)] = 0
     held_out: Annotated[int | list[int], BeforeValidator(_held_out)] = 0
 
     @model_validator(mode="after")
