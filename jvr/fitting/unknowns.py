@@ -187,7 +187,7 @@ def choose_unknowns(
     return Unknowns(indices, twins, names, ranges, by_channel, ordered, chosen)
 
 
-def _among_leaves(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> set[int]:
+def _among_leaves(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> set[int | None]:
     """Where leaves that `select` picks out are in the model's list."""
     return {index for group in _leaf_indices(model, select) for index in group}
 

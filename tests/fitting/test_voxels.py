@@ -175,6 +175,7 @@ def fit(function=jvr.fit, start=START, images=IMAGES, unknowns=VOXELS, **keyword
     return function(start, CAMERAS, images, unknowns=unknowns, **keywords)
 
 
+@pytest.mark.slow
 def test_grids_from_coarse_to_fine_are_one_fit():
     seen = []
     prior = jvr.TotalVariation(1e-5)
