@@ -10,12 +10,12 @@ from jvr.atomic import remove_parts
 from jvr.cli.inputs import BadInput
 
 CHECKPOINT, PAGE, RESULT, TRANSFER = "checkpoint.npz", "report.html", "result.json", "transfer.toml"
-VOLUME = "volume.mha"
-# Of a fit on several grids, those of the finer ones.
+CAMERAS, KNOWLEDGE, NEXT_VIEWS, VOLUME = "cameras.toml", "knowledge.npz", "next_views.png", "volume.mha"
+# Of a fit on several grids, those of the finer ones have a number.
 CHECKPOINTS = r"checkpoint(_\d+)?\.npz"
-CAMERAS = "cameras.toml"
 PICTURES = r"(target|fitted|difference)_(held_out_)?\d{2,}\.(exr|png)"
-WRITTEN = re.compile("|".join([PICTURES, CHECKPOINTS, *map(re.escape, (PAGE, RESULT, TRANSFER, CAMERAS, VOLUME))]))
+NAMES = (PAGE, RESULT, TRANSFER, CAMERAS, KNOWLEDGE, NEXT_VIEWS, VOLUME)
+WRITTEN = re.compile("|".join([PICTURES, CHECKPOINTS, *map(re.escape, NAMES)]))
 
 
 def results_in(folder: Path) -> list[Path]:

@@ -22,7 +22,7 @@ def fit_on_grids(
     *,
     unknowns: Callable[..., Any],
     levels: int = 3,
-    held_out: tuple[Sequence[AbstractCamera], Any] | None = None,
+    held_out: tuple[Any, ...] | None = None,
     max_steps: int = 100,
     checkpoint: str | Path | None = None,
     resume: bool = False,
