@@ -14,6 +14,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from jvr.execution.devices import everywhere, on_devices, over_rays
 from jvr.fitting.continuation import UNDETERMINED
 from jvr.fitting.evaluator import Evaluator
+from jvr.fitting.groups import Group
 from jvr.fitting.losses import AbstractPrior, SquaredError
 from jvr.fitting.objective import residual
 from jvr.fitting.observations import Observations, observe, prepare_in_fit
@@ -77,7 +78,7 @@ def voxel_errors(
     by the range of the scene's table (else of the voxels) before any picture: without that `A` would be singular where nothing is seen.
     An error above a quarter of that range says that the pictures do not determine the voxel, and is infinite.
 
-    Other unknowns of the fit count as known, residuals as independent, bounds and robust losses play no part.
+    Other unknowns of the fit count as known, residuals as independent; bounds, robust losses and lights of single views play no part.
 
     **Arguments:** `result`: of a fit of the voxels; `cameras`, `images`, `settings`, `weights`, `priors`: those of the fit; `noise`: the
     standard deviation of a pixel of weight 1, by default from the residuals, `s^2 = sum w r^2 / (residuals - freedom)`;
@@ -118,7 +119,7 @@ class _System:
         self.problem = problem
         self.observations = observe(model.scene, cameras, *targets, problem.settings)
         self.values = problem.unknowns.unconstrained_from_model(model)
-        evaluator = Evaluator(problem.least_squares(), self.observations, cameras, targets.images)
+        evaluator = Evaluator((Group(problem.least_squares(), self.observations),), cameras, targets.images)
         self.size, self.plausible = self.values.size, _plausible(model)
         self.measurements = evaluator.sums[-1].measurements
         self.squares = float(evaluator.functions.value(self.values, None)[0]) * evaluator.sums[-1].residuals
