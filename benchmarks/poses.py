@@ -8,6 +8,7 @@ import numpy as np
 import jvr
 from benchmarks.timing import median, ratio, seconds
 from jvr.fitting.evaluator import Evaluator
+from jvr.fitting.groups import Group
 from jvr.fitting.losses import SquaredError
 from jvr.fitting.observations import is_mostly_empty, observe
 from jvr.fitting.problem import Problem
@@ -22,7 +23,7 @@ def pose_step(scene: jvr.Scene, cameras: Any, images: Any, settings: jvr.Setting
     chosen = choose_unknowns(model, lambda m: m.views and m.views.motions, bounds=jvr.LevenbergMarquardt().bounds)
     problem = Problem(model, chosen, settings, SquaredError(), (), None, is_mostly_empty(scene, settings))
     observations = observe(scene, cameras, [np.asarray(image) for image in images], None, settings, unknown=range(len(cameras)))
-    evaluator, at = Evaluator(problem, observations, cameras, None), chosen.unconstrained_from_model(model)
+    evaluator, at = Evaluator((Group(problem, observations),), cameras, None), chosen.unconstrained_from_model(model)
     draw = jax.jit(jvr.render)
     pictures = lambda: [draw(scene, camera, settings).rgb for camera in cameras]
     times = seconds({"step": lambda: evaluator.expand(-1, at), "pictures": pictures}, repeats)

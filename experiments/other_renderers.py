@@ -1,12 +1,13 @@
 """Pictures that other renderers made: how near jvr comes with their transfer function, and how well it finds that function.
 
-`JVR_DATA=... python experiments/other_renderers.py [--json FILE] [--figure FILE] [--quick] [--only CASE ...]`
+`JVR_DATA=... python experiments/other_renderers.py [--json FILE] [--figure FILE] [--quick] [--only CASE ...]`, or `--files FOLDER`
 
 VTK's fixed-point ray caster and its GPU mapper (on the software rasteriser where there is no graphics card), without and with shading whose
 coefficients are unknown to the fit (but the diffuse one, which colours and it have as their product alone), and Mitsuba for a medium that
 absorbs alone. Seven views are fitted and one is kept aside. For each: the PSNR of jvr's picture of the known function, that of the fit (of
 the view that was kept aside), the RMSE of the opacity of a voxel and the share of values within two standard errors, both over what the
-pictures determine, and the time of the fit. What is not installed is left out; without scans a phantom stands for them.
+pictures determine, and the time of the fit. What is not installed is left out; without scans a phantom stands for them. `--files`
+writes what a user of VTK has at hand, eight screenshots, their cameras and a rough preset: those of configs/vtk.toml.
 """
 
 import argparse
@@ -25,6 +26,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -233,6 +235,37 @@ def figure(report: dict[str, Any], path: str) -> None:
     drawing.savefig(path, dpi=110)
 
 
+def write_files(folder: Path, size: int = 64) -> None:
+    """Pictures of the demonstration's volume by VTK's GPU mapper in 8 bits, as `view_0.png` ..., `cameras.json`, and `start.vp.json`, a
+    preset that knows where the volume has something and no more."""
+    from benchmarks.peers import vtk_mappers
+    from jvr.io import interop
+    from jvr.io.config import read_config
+    from jvr.io.config.transfers import build_transfer, resampled
+    from jvr.io.demo import demo_volume
+
+    volume, config = demo_volume(), read_config(Path(__file__).parents[1] / "configs" / "demo.toml")
+    assert config.tables.truth is not None
+    truth = resampled(build_transfer(config.tables.truth, volume, config.name, "truth"), 65)
+    voxels, spacing = np.asarray(volume.values), np.asarray(volume.spacing, float)
+    place = tuple(map(float, spacing)), tuple(np.asarray(volume.world_from_grid, float)[:3, 3].tolist())
+    table = np.asarray(truth.rgb), np.asarray(truth.sigma_t)
+    hull = (np.asarray(voxels.shape) - 1) * spacing
+    scene = scenes.Scene("demo", "formula", voxels, *place, *table, (float(truth.domain[0]), 1.0), view((0, -1, 0), hull, size))
+    cameras = []
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, one in enumerate(views(scene, size)):
+        renderer = vtk_mappers.GpuRenderer(one)
+        renderer.prepare(STEP)
+        renderer.draw()
+        Image.fromarray(np.rint(255 * renderer.picture()).astype(np.uint8)).save(folder / f"view_{i}.png")
+        said = {"position": one.view.eye, "focal_point": one.view.target, "view_up": one.view.up, "view_angle": one.view.fov_y}
+        cameras.append(said | {"width": size, "height": size})
+    (folder / "cameras.json").write_text(json.dumps(cameras, indent=1) + "\n")
+    rough = jvr.LinearTransfer([0.05, 0.15, 1.0], np.full((3, 3), 0.5), [0.0, 0.02, 0.02])
+    interop.write_slicer(folder / "start.vp.json", interop.Preset(rough))
+
+
 def main() -> None:
     """Runs the cases, prints a line for each, and writes JSON and a figure on request."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -240,7 +273,11 @@ def main() -> None:
     parser.add_argument("--figure", metavar="FILE")
     parser.add_argument("--only", nargs="+", metavar="CASE", help="those whose name contains one of these words")
     parser.add_argument("--quick", action="store_true", help="a phantom, small pictures")
+    parser.add_argument("--files", type=Path, metavar="FOLDER", help="write what a user of VTK has at hand, and run nothing")
     a = parser.parse_args()
+    if a.files:
+        write_files(a.files)
+        return
     report = {}
     print(f"{'case':<40}{'known':>8}{'held out':>10}{'opacity':>9}{'in 2 se':>9}{'determined':>12}{'steps':>7}{'time':>8}")
     for name, make in cases(24 if a.quick else 128, a.quick).items():

@@ -126,7 +126,10 @@ def point(x: float, y: float, z: float, intensity: float = 20.0) -> tuple[Any, .
 
 def along(*direction: float) -> tuple[Any, ...]:
     """A directional light, and a point light that is far away in the direction it comes from."""
-    return jvr.DirectionalLight(direction), jvr.PointLight(np.array([2.0, 2.5, 3.0]) - 40 * np.array(direction), 1600.0)
+    # White in three numbers: the same program as for the coloured lights of other rows.
+    return jvr.DirectionalLight(direction, np.ones(3)), jvr.PointLight(
+        np.array([2.0, 2.5, 3.0]) - 40 * np.array(direction), 1600.0
+    )
 
 
 def rows(quick: bool = False) -> dict[str, list[Case]]:
@@ -390,28 +393,35 @@ def all_finite(tree: Any) -> bool:
 
 def table(quick: bool = False, report: Callable[[str, Case, Found], None] | None = None):
     """For each row the worst error of value and of gradient, and what is not finite."""
-    ways, result, structure = compiled_ways(), [], None
-    for number, (name, cases) in enumerate(rows(quick).items()):
-        found, before = [], structure
-        structure = jax.tree.structure(cases[0].scene)
-        if before is not None and structure != before:
-            # Programs of other scenes are of no more use, and hundreds of them exhaust a process's memory mappings.
+    ways, found, latest = compiled_ways(), {}, None
+    of_rows = rows(quick)
+    first = {id(cases[0]) for number, cases in enumerate(of_rows.values()) if number % 4 == 0}
+    # Cases of one structure come together: programs of others are of no more use, and hundreds of them exhaust a process's memory mappings.
+    for name, case in sorted(((n, c) for n, cases in of_rows.items() for c in cases), key=lambda pair: _structure(pair[1])):
+        if _structure(case) != latest:
             jax.clear_caches()
-        for k, case in enumerate(cases):
-            # Forward mode and vmap take longest to compile and say the least.
-            found.append(measured(case, ways, modes=not quick or (k == 0 and number % 4 == 0)))
-            if report:
-                report(name, case, found[-1])
-        result.append(
-            {
-                "case": name,
-                "value": max(f.value for f in found),
-                "gradient": max(f.gradient for f in found),
-                "worst": max(found, key=lambda f: f.gradient).worst,
-                "not finite": sorted({mode for f in found for mode in f.infinite}),
-            }
-        )
-    return result
+            latest = _structure(case)
+        # Forward mode and vmap take longest to compile and say the least.
+        found[id(case)] = measured(case, ways, modes=not quick or id(case) in first)
+        if report:
+            report(name, case, found[id(case)])
+    return [_row(name, [found[id(case)] for case in cases]) for name, cases in of_rows.items()]
+
+
+def _structure(case: Case) -> str:
+    """What tells the programs of two cases apart."""
+    return str(jax.tree.map(lambda x: (np.shape(x), np.asarray(x).dtype), (case.scene, case.camera)))
+
+
+def _row(name: str, found: list[Found]) -> dict[str, Any]:
+    """The worst of a row's cases."""
+    return {
+        "case": name,
+        "value": max(f.value for f in found),
+        "gradient": max(f.gradient for f in found),
+        "worst": max(found, key=lambda f: f.gradient).worst,
+        "not finite": sorted({mode for f in found for mode in f.infinite}),
+    }
 
 
 def figure(result: list[dict[str, Any]], path: str) -> None:

@@ -108,7 +108,8 @@ def test_vmap():
     close(jax.vmap(of)(both), jnp.stack([of(rgb) for rgb in both]))
 
 
-@pytest.mark.parametrize("keep", [True, pytest.param(False, marks=slow)])
+@slow
+@pytest.mark.parametrize("keep", [True, False])
 def test_fits(keep):
     scene, cameras = plain(), [perspective(plain().volume, 12, 9), perspective(plain().volume, 7, 10)]
     images = [np.asarray(jvr.render(scene, camera).rgb) for camera in cameras]

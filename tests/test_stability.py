@@ -23,15 +23,3 @@ def test_hard_cases():
         assert not row["not finite"], row
         assert row["value"] < VALUE, row
         assert row["gradient"] < GRADIENT, row
-
-
-@pytest.mark.slow
-def test_an_opaque_medium_keeps_its_digits():
-    """Depth 0, 1e-3, 1e4 to the eye and to both lights."""
-    ways = stability.compiled_ways()
-    (cases,) = list(stability.rows(quick=True).values())[:1]
-    for case in cases:
-        found = stability.measured(case, ways, modes=False)
-        assert not found.infinite, (case.label, found)
-        assert found.value < VALUE, (case.label, found)
-        assert found.gradient < GRADIENT, (case.label, found)

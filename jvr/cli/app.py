@@ -20,39 +20,31 @@ from jvr.cli.inputs import (
     name_of,
     reading,
 )
+from jvr.cli.options import (
+    Array,
+    Axes,
+    Channel,
+    ConfigFile,
+    Direction,
+    Dtype,
+    Force,
+    Input,
+    Intercept,
+    Json,
+    Missing,
+    NanValue,
+    Origin,
+    Series,
+    Set,
+    Shape,
+    Slope,
+    Spacing,
+    Time,
+)
 
 HELP = "Differentiable volume rendering: pictures of scalar volumes, and transfer functions from pictures."
 # Without markup, which would take the names of tables in brackets for its own.
 app = typer.Typer(help=HELP, rich_markup_mode=None, pretty_exceptions_enable=False)
-
-Set = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key, e.g. settings.step=0.25. Repeatable.")
-]
-Json = Annotated[bool, typer.Option("--json", help="Print one machine-readable object on stdout.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace the results of another fit in the folder.")]
-Shape = Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Voxels of a headerless file.")]
-Dtype = Annotated[str | None, typer.Option(help="NumPy type of a headerless file, such as uint8 or >i2.")]
-Spacing = Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Millimetres between voxels, in place of the file's.")]
-Origin = Annotated[
-    str | None, typer.Option(metavar="X,Y,Z", help="Position of the first voxel in millimetres, in place of the file's.")
-]
-Direction = Annotated[
-    str | None, typer.Option(metavar="NUMBERS", help="Nine numbers: x, y, z of each of the grid's axes, in place of the file's.")
-]
-Slope = Annotated[float | None, typer.Option(help="Data units for one stored, in place of the file's.")]
-Intercept = Annotated[float | None, typer.Option(help="Data units where 0 is stored, in place of the file's.")]
-Array = Annotated[str | None, typer.Option("--array", help="Which array of a .vtk, .vti or .zarr, or image of a .tif.")]
-Series = Annotated[str | None, typer.Option(help="Which series of a DICOM folder.")]
-Axes = Annotated[str | None, typer.Option(help="Names of the axes of a .npy, .tif or .zarr, such as zyx or tczyx.")]
-Channel = Annotated[str | None, typer.Option(help="Which of several channels: its index from 0, or its name.")]
-Time = Annotated[int | None, typer.Option("--time", min=0, help="Which of several points in time: its index from 0.")]
-NanValue = Annotated[float | None, typer.Option(help="Number that takes the place of NaN and infinite voxels.")]
-Missing = Annotated[
-    str | None,
-    typer.Option(metavar="NUMBER|none", help='The number that means "no data", in data units.', show_default="by the file"),
-]
-Input = Annotated[Path, typer.Argument(metavar="CONFIG|VOLUME", help="A configuration (.toml) or a volume file.")]
-ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="A configuration (.toml).")]
 
 
 def _examples(*lines: str) -> str:
@@ -338,6 +330,48 @@ def preset(
         report = convert(given, output, name, ends, unit_distance, spacing, encoding)
     shading = [f"[shading]  {report['shading']}"] if report["shading"] else []
     _print(report, as_json, "\n".join([*shading, f"written to {output}"]))
+
+
+@app.command(
+    "next-view",
+    epilog=_examples(
+        "jvr next-view out",
+        "jvr next-view out --cameras could_be_taken.toml",
+        "jvr next-view out --cameras transforms.json --json",
+    ),
+)
+def next_view(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="What jvr fit -o has written.")],
+    cameras: Annotated[
+        Path | None,
+        typer.Option(
+            help="Views that could be taken: [[camera]] tables (.toml), transforms.json, VTK's cameras (.json), or a .pvcc.",
+            show_default="from all around",
+        ),
+    ] = None,
+    count: Annotated[int | None, typer.Option(min=1, max=10_000, help="Views from all around.", show_default="32")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Picture of the best three, .png or .exr.", show_default="FOLDER/next_views.png"),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Rank views by what one more of them would tell about the unknowns of a finished fit.
+
+    Bits are information about all unknowns together; beside them are the median standard errors of each fitted array before and after. No
+    picture is needed for that. Gains of several views do not add up: take the best, fit again, ask again.
+    """
+    from jvr.cli.folder import NEXT_VIEWS
+    from jvr.cli.next_view import rank_views, table
+
+    with reading():
+        if cameras is not None and count is not None:
+            raise BadInput("--count is of views from all around; leave it or --cameras out")
+        output = folder / NEXT_VIEWS if output is None else output
+        if folder.is_dir():
+            check_image_output(output)
+    report = rank_views(folder, cameras, count or 32, output)
+    _print(report, as_json, table(report))
 
 
 def _sized(config: Any, size: int | None) -> Any:

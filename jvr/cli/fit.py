@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from jvr.cli.beforehand import Beforehand
-from jvr.cli.folder import CAMERAS, CHECKPOINT, PAGE, RESULT, TRANSFER, alone_in, check_results, results_in
+from jvr.cli.folder import CAMERAS, CHECKPOINT, KNOWLEDGE, PAGE, RESULT, TRANSFER, alone_in, check_results, results_in
 from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by_jvr, warnings_as_lines
 from jvr.cli.runtime import nested, plain, progress, provenance, start_jax
 from jvr.cli.signals import INTERRUPTED, Terminated, said
 from jvr.io.config import Config, FitJob, build_fit, write_transfer
 from jvr.io.config.cameras import write_cameras
 from jvr.io.config.parts import choices_of
+from jvr.io.knowledge import write_knowledge
 from jvr.model.exact import in_double
 
 
@@ -87,19 +88,20 @@ def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
 def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float, beforehand: Beforehand) -> dict[str, Any]:
     from jvr.atomic import replacing
 
-    fitted = _pictures(result.scene, result.exposure, result.cameras, job)
+    fitted = _pictures(result.scene, result.exposure, result.cameras, job, job.keywords["lights"])
     # Of another run: it may have had more views.
     for path in results_in(folder):
         if path.name != CHECKPOINT:
             path.unlink()
     for i, (target, found) in enumerate(zip(job.targets, fitted, strict=True)):
         _write_views(folder, f"{i:02d}", target, found)
-    held_cameras, held_targets = job.held_out or ((), ())
-    held_fitted = _pictures(result.scene, result.exposure, held_cameras, job)
+    held_cameras, held_targets, *held_lights = job.held_out or ((), ())
+    held_fitted = _pictures(result.scene, result.exposure, held_cameras, job, *held_lights)
     for i, (target, found) in enumerate(zip(held_targets, held_fitted, strict=True)):
         _write_views(folder, f"held_out_{i:02d}", target, found)
     write_transfer(folder / TRANSFER, result.scene.transfer)
     write_cameras(folder / CAMERAS, result.cameras)
+    write_knowledge(folder / KNOWLEDGE, config, result)
     report = _report(config, job, result, (fitted, held_fitted))
     report["transfer_kept"] = _with_transfer_of_its_own(job, result, beforehand) if job.keeps_radiance_transfer else None
     report |= {"precomputed": beforehand.report, "seconds": time.perf_counter() - began}
@@ -114,14 +116,17 @@ def _with_transfer_of_its_own(job: FitJob, result: Any, beforehand: Beforehand) 
     import equinox as eqx
 
     scene = beforehand(eqx.tree_at(lambda s: s.radiance_transfer.projected, result.scene, None))
-    return _scores(job.targets, _pictures(scene, result.exposure, result.cameras, job))
+    return _scores(job.targets, _pictures(scene, result.exposure, result.cameras, job, job.keywords["lights"]))
 
 
-def _pictures(scene: Any, exposure: float, cameras: Any, job: FitJob) -> list[np.ndarray]:
-    """What a scene looks like from each camera, in the radiance of the target images."""
+def _pictures(scene: Any, exposure: float, cameras: Any, job: FitJob, lights: Any = None) -> list[np.ndarray]:
+    """What a scene looks like from each camera, under its own lights or those of each view, in the radiance of the target images."""
+    from jvr.fitting.groups import lit
     from jvr.rendering.render import render
 
-    return [exposure * np.asarray(render(scene, camera, job.keywords["settings"]).rgb) for camera in cameras]
+    scenes = [scene if lights is None else lit(scene, lights[i], i) for i in range(len(cameras))]
+    settings = job.keywords["settings"]
+    return [exposure * np.asarray(render(one, camera, settings).rgb) for one, camera in zip(scenes, cameras, strict=True)]
 
 
 def _write_views(folder: Path, name: str, target: np.ndarray, fitted: np.ndarray) -> None:
@@ -145,7 +150,7 @@ def _write_page(folder: Path, config: Config, job: FitJob, result: Any, fitted: 
         result=result,
         targets=job.targets,
         fitted=fitted,
-        before=_pictures(job.scene, 1.0, job.cameras, job),
+        before=_pictures(job.scene, 1.0, job.cameras, job, job.keywords["lights"]),
         truth=job.truth,
         command=shlex.join(["jvr", "fit", config.name, "-o", str(folder), *sets]),
         config_text=config.text or None,

@@ -10,9 +10,9 @@ from jvr.atomic import remove_parts
 from jvr.cli.inputs import BadInput
 
 CHECKPOINT, PAGE, RESULT, TRANSFER = "checkpoint.npz", "report.html", "result.json", "transfer.toml"
-CAMERAS = "cameras.toml"
+CAMERAS, KNOWLEDGE, NEXT_VIEWS = "cameras.toml", "knowledge.npz", "next_views.png"
 PICTURES = r"(target|fitted|difference)_(held_out_)?\d{2,}\.(exr|png)"
-WRITTEN = re.compile("|".join([PICTURES, *map(re.escape, (CHECKPOINT, PAGE, RESULT, TRANSFER, CAMERAS))]))
+WRITTEN = re.compile("|".join([PICTURES, *map(re.escape, (CHECKPOINT, PAGE, RESULT, TRANSFER, CAMERAS, KNOWLEDGE, NEXT_VIEWS))]))
 
 
 def results_in(folder: Path) -> list[Path]:

@@ -27,11 +27,11 @@ class CheckpointError(ValueError):
     """A checkpoint that does not belong to this fit, or cannot be read."""
 
 
-def fingerprint(problem: Problem, given: tuple[Any, Any, Any], solver: Any, coarse_levels: int = 0) -> Fingerprint:
-    """A digest of each thing that a fit depends on, by its name: a checkpoint is not taken up by another fit. `given`: cameras, images and
-    weights."""
+def fingerprint(problem: Problem, given: tuple[Any, Any, Any, Any], solver: Any, coarse_levels: int = 0) -> Fingerprint:
+    """A digest of each thing that a fit depends on, by its name: a checkpoint is not taken up by another fit. `given`: cameras, images,
+    weights and the lights of each view."""
     scene = {field.name: getattr(problem.model.scene, field.name) for field in dataclasses.fields(problem.model.scene)}
-    parts = scene | dict(zip(("cameras", "images", "weights"), given, strict=True))
+    parts = scene | dict(zip(("cameras", "images", "weights", "lights of views"), given, strict=True))
     parts |= {
         "unknowns": problem.unknowns.names,
         "transforms": problem.unknowns.bijectors,

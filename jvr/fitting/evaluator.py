@@ -1,7 +1,8 @@
 """The functions that solvers call, over the rays of one fit."""
 
 import functools
-from collections.abc import Iterable, Sequence
+import operator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,9 +13,10 @@ from jaxtyping import Array, Float
 
 from jvr.execution.devices import everywhere, shares
 from jvr.fitting.continuation import Quadratic
+from jvr.fitting.groups import Group
 from jvr.fitting.identifiability import Identifiability, Scores, identifiability
 from jvr.fitting.losses import DSSIM, SquaredError
-from jvr.fitting.normal_equations import Normal, light_tangents, normal_equations, prior_expansion, scored
+from jvr.fitting.normal_equations import LightTangents, Normal, light_tangents, normal_equations, prior_expansion, scored
 from jvr.fitting.objective import image_value, residuals, value
 from jvr.fitting.observations import Observations
 from jvr.fitting.problem import Problem
@@ -31,15 +33,19 @@ LEAST_RESIDUALS = 24
 ROUNDING = 16
 
 
+# Problem, values, observations and the index of a tile.
+Tile = tuple[Problem, Float[Array, "unknowns"], Observations, int]
+
+
 class ValueFunction(eqx.Module):
     """The objective as Optimistix calls it."""
 
-    problem: Problem
-    tiles: Observations
+    groups: tuple[Group, ...]
     total: Scalar
 
     def __call__(self, unconstrained: Float[Array, "unknowns"], args: None) -> tuple[Scalar, None]:
-        return value(self.problem, unconstrained, self.tiles, self.total), None
+        values = [value(group.problem, unconstrained, group.observations, self.total) for group in self.groups]
+        return functools.reduce(operator.add, values), None
 
 
 class ImageValueFunction(eqx.Module):
@@ -56,24 +62,29 @@ class ImageValueFunction(eqx.Module):
 class ResidualFunction(eqx.Module):
     """`residuals` as Optimistix calls them."""
 
-    problem: Problem
-    tiles: Observations
+    groups: tuple[Group, ...]
     total: Scalar
 
     def __call__(self, unconstrained: Float[Array, "unknowns"], args: None) -> tuple[Float[Array, "residuals"], None]:
-        return residuals(self.problem, unconstrained, self.tiles, self.total), None
+        parts = [residuals(group.problem, unconstrained, group.observations, self.total) for group in self.groups]
+        return parts[0] if len(parts) == 1 else jnp.concatenate(parts), None
 
 
 class Evaluator:
-    """A problem and its observations, ready for a solver; everything that is large lives here once."""
+    """The groups of a fit, ready for a solver; everything that is large lives here once. `problem`: the first's, for what they share."""
 
-    def __init__(self, problem: Problem, observations: Observations, cameras: Sequence[AbstractCamera], images: Any):
-        self.problem = problem
-        self.observations = observations
+    def __init__(self, groups: tuple[Group, ...], cameras: Sequence[AbstractCamera], images: Any):
+        self.groups = groups
+        self.problem = groups[0].problem
+        self.dtype = groups[0].observations.target.dtype
         # A level takes every so-manieth ray.
-        self.levels = _levels(problem, observations)
-        self.sums = tuple(_sums(observations, every) for every in self.levels)
+        self.levels = _levels(groups)
+        self.sums = tuple(_sums(groups, every) for every in self.levels)
         self.functions = self._functions(cameras, images)
+
+    def settle(self, problem: Problem) -> None:
+        """Takes the problem at the end of its iteration in the place of that of the first group."""
+        self.problem, self.groups = problem, (Group(problem, self.groups[0].observations), *self.groups[1:])
 
     def expand(self, level: int, unconstrained: Float[Array, "unknowns"]) -> tuple[float, Normal]:
         """The objective at `unconstrained`, over the rays of a level, and the normal equations in the unknowns' own values."""
@@ -99,11 +110,11 @@ class Evaluator:
     def _rounding(self) -> float:
         """The mean squared error of pictures that differ by the rounding of sums along rays alone."""
         sums = self.sums[-1]
-        return (ROUNDING * float(jnp.finfo(self.observations.target.dtype).eps)) ** 2 * sums.squares / sums.residuals
+        return (ROUNDING * float(jnp.finfo(self.dtype).eps)) ** 2 * sums.squares / sums.residuals
 
     def solution(self, values: Float[Array, "unknowns"]) -> tuple[Identifiability, Quadratic]:
         """Standard errors at the solution, and the objective about it, over all rays."""
-        normal, scores = self._scored(values, self._squares)
+        normal, scores = self._scored(values)
         matrix, epsilon = normal.matrix + self._gauge(values, np.diag(normal.matrix)), float(jnp.finfo(values.dtype).eps)
         known = identifiability(matrix, float(normal.squares), self.sums[-1].measurements, epsilon, scores)
         prior, slope, curvature = self._prior(values)
@@ -113,13 +124,8 @@ class Evaluator:
 
     def objective(self, values: np.ndarray) -> float:
         """The objective as `solution` has it, of the unknowns' own values."""
-        at = jnp.asarray(values, self.observations.target.dtype)
-        return float(self._sum(at, 1, self._squares).loss) / self.sums[-1].residuals + float(self._prior(at)[0])
-
-    @property
-    def _squares(self) -> Problem:
-        """The problem as least squares: a loss over whole images has no rows."""
-        return self.problem.least_squares() if isinstance(self.problem.loss, DSSIM) else self.problem
+        at = jnp.asarray(values, self.dtype)
+        return float(self._sum(at, 1).loss) / self.sums[-1].residuals + float(self._prior(at)[0])
 
     def _prior(self, values: Float[Array, "unknowns"]) -> tuple[Any, Any, Any]:
         """Value, gradient and Hessian of the priors in float64."""
@@ -147,36 +153,41 @@ class Evaluator:
         elif isinstance(self.problem.loss, SquaredError) and not self.problem.priors:
             mean = loss
         else:
-            total = jnp.asarray(self.sums[-1].residuals)
-            mean = float(_mean_squares(self.problem.least_squares(), jnp.asarray(unconstrained), self.observations, total))
+            at, total = jnp.asarray(unconstrained), jnp.asarray(self.sums[-1].residuals)
+            each = [_mean_squares(g.problem.least_squares(), at, g.observations, total) for g in self.groups]
+            mean = float(functools.reduce(operator.add, each))
         return float(-10 * np.log10(max(mean, 1e-20)))
 
     def fraction(self, level: int) -> float:
         """Of all rays, how many a level takes."""
-        every = self.levels[level]
-        return self.observations.tile_count(every) / self.observations.tile_count()
+        count = lambda every: sum(group.observations.tile_count(every) for group in self.groups)
+        return count(self.levels[level]) / count(1)
 
-    def _sum(self, values: Float[Array, "unknowns"], every: int, problem: Problem | None = None) -> Normal:
+    def _tiles(self, values: Float[Array, "unknowns"], every: int) -> Iterator[tuple[Tile, LightTangents | None]]:
+        """Each tile of each group, and its light. A loss over whole images has no rows; in its place are squares."""
+        for group in self.groups:
+            problem = group.problem.least_squares() if isinstance(group.problem.loss, DSSIM) else group.problem
+            around = light_tangents(problem, values)
+            for index in range(group.observations.tile_count(every)):
+                yield (problem, values, group.observations, index), around
+
+    def _sum(self, values: Float[Array, "unknowns"], every: int) -> Normal:
         """The normal equations of every `every`-th ray, all chunks together, in float64."""
-        problem, observations = problem or self.problem, self.observations
-        around = light_tangents(problem, values)
-        tiles = range(observations.tile_count(every))
-        return _added(normal_equations(problem, values, observations, i, every, around) for i in tiles)
+        return _added(normal_equations(*tile, every, around) for tile, around in self._tiles(values, every))
 
-    def _scored(self, values: Float[Array, "unknowns"], problem: Problem) -> tuple[Normal, Scores]:
+    def _scored(self, values: Float[Array, "unknowns"]) -> tuple[Normal, Scores]:
         """The normal equations of all rays, and the sums that tell misfit from noise."""
-        observations, around, blocks = self.observations, light_tangents(problem, values), self.sums[-1].blocks
-        return _added(scored(problem, values, observations, i, blocks, around) for i in range(observations.tile_count()))
+        blocks = self.sums[-1].blocks
+        return _added(scored(*tile, blocks, around) for tile, around in self._tiles(values, 1))
 
     def _functions(self, cameras: Sequence[AbstractCamera], images: Any) -> Functions:
         total = jnp.asarray(self.sums[-1].residuals)
         if isinstance(self.problem.loss, DSSIM):
             function = ImageValueFunction(self.problem, tuple(cameras), tuple(jnp.asarray(image) for image in images))
         else:
-            function = ValueFunction(self.problem, self.observations, total)
-        residuals = ResidualFunction(self.problem, self.observations, total)
+            function = ValueFunction(self.groups, total)
         levels = tuple(functools.partial(self.expand, i) for i in range(len(self.levels)))
-        return Functions(function, residuals, levels, self.limits, self.quadratic, self._rounding())
+        return Functions(function, ResidualFunction(self.groups, total), levels, self.limits, self.quadratic, self._rounding())
 
 
 def _added(parts: Iterable[Any]) -> Any:
@@ -198,10 +209,10 @@ class Sums(NamedTuple):
     blocks: int
 
 
-def _sums(observations: Observations, every: int) -> Sums:
-    weight, squares, counted, last = _weights(observations, every)
-    total = max(3 * float(weight), float(np.finfo(np.float32).tiny))
-    return Sums(total, float(squares), 3 * int(counted), int(last) + 1)
+def _sums(groups: tuple[Group, ...], every: int) -> Sums:
+    weight, squares, counted, last = zip(*(_weights(group.observations, every) for group in groups), strict=True)
+    total = max(3 * sum(map(float, weight)), float(np.finfo(np.float32).tiny))
+    return Sums(total, sum(map(float, squares)), 3 * sum(map(int, counted)), max(map(int, last)) + 1)
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -213,12 +224,15 @@ def _weights(observations: Observations, every: int) -> tuple[Array, Array, Arra
     return everywhere((jnp.sum(weight), squares, jnp.sum(weight > 0), jnp.max(observations.block)))
 
 
-def _levels(problem: Problem, observations: Observations) -> tuple[int, ...]:
+def _levels(groups: tuple[Group, ...]) -> tuple[int, ...]:
     """All rays, after a subset that still over-determines the unknowns where that is much smaller."""
+    problem, observations = groups[0].problem, [group.observations for group in groups]
     unknowns = sum(v.size for v in problem.unknowns.values(problem.model))
-    every = min(MOST_THINNING, 3 * observations.size // max(LEAST_RESIDUALS * unknowns, observations.chunk))
+    tiles = lambda every: sum(o.tile_count(every) for o in observations)
+    rays, together = sum(o.size for o in observations), sum(o.chunk for o in observations)
+    every = min(MOST_THINNING, 3 * rays // max(LEAST_RESIDUALS * unknowns, together))
     # Where a subset fills as many tiles it takes as long.
-    saves = lambda: problem.model.views is None or observations.tile_count(every) < observations.tile_count()
+    saves = lambda: (problem.model.views is None and len(groups) == 1) or tiles(every) < tiles(1)
     return (every, 1) if every >= 2 and saves() else (1,)
 
 

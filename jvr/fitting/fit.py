@@ -18,13 +18,14 @@ from jvr.fitting.checkpoint import fingerprint
 from jvr.fitting.continuation import continued
 from jvr.fitting.descent import Checkpoint, Descent
 from jvr.fitting.evaluator import Evaluator
+from jvr.fitting.groups import Group, Lights, groups_of, lights_of, lit
 from jvr.fitting.identifiability import Identifiability, undetermined
 from jvr.fitting.kinds import march_unknowns
 from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.minimisers import OptimistixSolver
 from jvr.fitting.objective import check_derivatives
-from jvr.fitting.observations import Observations, check_settings, is_mostly_empty, keep_samples, observe
+from jvr.fitting.observations import check_settings, is_mostly_empty
 from jvr.fitting.problem import Problem
 from jvr.fitting.reach import known_background, say_what_is_out_of_reach
 from jvr.fitting.result import FitResult, FitStats, Iteration
@@ -34,14 +35,11 @@ from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns, is_sha
 from jvr.fitting.views import Views
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
-from jvr.model.transfer import AbstractTable
 from jvr.rendering.measure import psnr, similarity
 from jvr.rendering.render import render
 from jvr.rendering.settings import Settings
 from jvr.types import Outcome
 
-# Kept samples are given up where they would take more than this many bytes.
-KEEP_LIMIT = 2**30
 # The Jacobian of other unknowns than a table's entries takes one march for each.
 MOST_FORWARD = 512
 
@@ -58,8 +56,9 @@ def fit(
     priors: Sequence[AbstractPrior] = (),
     transforms: Any = None,
     weights: Sequence[Any] | None = None,
+    lights: Any = None,
     exposure: bool = False,
-    held_out: tuple[Sequence[AbstractCamera], Any] | None = None,
+    held_out: tuple[Any, ...] | None = None,
     keep_samples: bool | int = True,
     smooth_undetermined: bool = True,
     coarse_levels: int = 0,
@@ -84,8 +83,9 @@ def fit(
     - `loss`: `jvr.SquaredError()`, `jvr.Huber()`, `jvr.AbsoluteError()` or, for solvers that use gradients alone, `jvr.DSSIM()`.
     - `priors`: penalties added to the mean loss; `transforms`: one for each unknown array, see `jvr.fitting.unknowns`.
     - `weights`: one `(height, width)` array for each image, not negative, such as masks.
+    - `lights`: of each view, a light or a sequence of them, in place of the scene's; they are known. All else is shared.
     - `exposure`: also fit the factor between rendered and target radiance.
-    - `held_out`: `(cameras, images)` that are only compared with at the end.
+    - `held_out`: `(cameras, images)` or `(cameras, images, lights)` that are only compared with at the end.
     - `keep_samples`: keep the resampled values along all rays (2 bytes each) while the volume is not unknown, so that no step touches
       the volume again; a number is the most bytes to take (`True`: 1 GiB), beyond which every step resamples.
     - `smooth_undetermined`: continue entries of a table that the images do not determine smoothly from those that they do, in place of what
@@ -117,35 +117,42 @@ def fit(
     scene, views = scene.current(), () if isinstance(cameras, AbstractCamera) else tuple(cameras)
     model = _with_views(ExposedModel(scene, jnp.ones(()) if exposure else None), views, unknowns)
     choose = lambda model: _choose(model, views, unknowns, transforms, solver)
-    model = _without_stale(model, choose(model))
+    model = without_stale(model, choose(model))
     scene, chosen = model.scene, choose(model)
     behind = known_background(model, chosen)
     targets, weights = given = targets_of(cameras, images, weights, behind)
-    held = None if held_out is None else (held_out[0], targets_of(*held_out, None, behind, "held-out image"))
+    lights = lights_of(lights, cameras)
+    held = None if held_out is None else _held_out(held_out, behind)
     start = chosen.model_from_unconstrained(model, chosen.unconstrained_from_model(model))
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
     forwards = _check(problem, solver, given, coarse_levels)
     say_what_is_out_of_reach(problem, given)
 
     unknown = chosen.views(model)
-    observations = observe(scene, cameras, targets, weights, settings, unknown=unknown)
-    problem, observations = _keep(problem, observations, keep_samples)
+    if lights is not None and coarse_levels:
+        raise ValueError("coarse_levels know one light for all views: leave one of the two out")
+    groups = groups_of(problem, choose, (cameras, given), lights, keep_samples, unknown)
+    problem, observations = groups[0].problem, groups[0].observations
     check_derivatives(problem, observations, forwards=forwards)
-    evaluator = Evaluator(problem, observations, cameras, targets)
+    evaluator = Evaluator(groups, cameras, targets)
     file = None
     if checkpoint:
-        file = Checkpoint(Path(checkpoint), fingerprint(problem, (cameras, targets, weights), solver, coarse_levels), resume)
+        file = Checkpoint(
+            Path(checkpoint), fingerprint(problem, (cameras, targets, weights, lights), solver, coarse_levels), resume
+        )
     with Descent(solver, max_steps, began, progress) as descent:
         # What is taken up again has left the coarse levels behind.
         for factor in () if file and file.is_there else coarse.factors(views, coarse_levels):
             rough, rays = coarse.level(problem, model, given, views, factor, choose, unknown)
-            found = descent.run(Evaluator(rough, rays, views, None), rough, share=rays.size / observations.size)
+            found = descent.run(Evaluator((Group(rough, rays),), views, None), rough, share=rays.size / observations.size)
             model = chosen.insert(model, rough.unknowns.split(found, rough.model))
         # The observations hold them.
         del targets, given
         values = descent.run(evaluator, problem, chosen.unconstrained_from_model(model), file)
     problem, values = _settled(problem, values)
-    evaluator.problem, model = problem, problem.model
+    evaluator.settle(problem)
+    # The problem of the first group has its lights.
+    model = problem.model if lights is None else model
     known, quiet = undetermined(values.size), np.zeros(values.size, bool)
     if march_unknowns(problem) <= MOST_FORWARD:
         known, around = evaluator.solution(values)
@@ -157,7 +164,7 @@ def fit(
     picked, structure = jax.tree.flatten(selected(unknowns, scene, views), is_leaf=is_shared)
     stats = FitStats(
         seconds=time.perf_counter() - began,
-        kept_bytes=0 if problem.samples is None else problem.samples.bytes,
+        kept_bytes=sum(group.problem.samples.bytes for group in groups if group.problem.samples is not None),
         residual_variance=known.variance,
         rank=known.rank,
         condition=known.condition,
@@ -177,6 +184,7 @@ def fit(
         exposure=1.0 if found.exposure is None else float(found.exposure),
         stats=stats,
         cameras=views if found.views is None else found.views.cameras,
+        settings=settings,
     )
 
 
@@ -211,7 +219,7 @@ def _choose(
     return choose_unknowns(model, _select(unknowns, cameras), transforms, solver.bounds)
 
 
-def _without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
+def without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
     """The model without what was computed of the unknowns' start and would stay so: what its volume keeps, and a radiance transfer, which
     is taken as it is."""
     transfer = lambda m: m.scene.radiance_transfer
@@ -255,24 +263,6 @@ def _check(problem: Problem, solver: AbstractSolver, given: Targets, coarse_leve
     return is_least_squares
 
 
-def _keep(problem: Problem, observations: Observations, keep: bool | int) -> tuple[Problem, Observations]:
-    """Samples along the rays, where the volume and its clipping are known and memory allows."""
-    among = lambda select: problem.unknowns.among(problem.model, select)
-    moving = problem.model.views is not None or among(lambda m: (m.scene.volume, m.scene.clipping))
-    # What is kept is the scalar alone.
-    only_scalars = problem.integrator.marches and not problem.model.scene.needs_gradient
-    if keep is False or moving or not only_scalars or isinstance(problem.loss, DSSIM):
-        return problem, observations
-    limit = KEEP_LIMIT if keep is True else keep
-    # Colours and extinctions of a table leave its ends where they are; whatever else it has may move them.
-    entries = lambda transfer: (transfer.rgb, transfer.sigma_t) if isinstance(transfer, AbstractTable) else ()
-    clamped = among(lambda m: m.scene.transfer) == among(lambda m: entries(m.scene.transfer))
-    kept = keep_samples(problem.model.scene, observations, problem.settings, limit, clamped=clamped)
-    if kept is None:
-        return problem, observations
-    return problem.with_samples(kept[0]), kept[1]
-
-
 def _settled(problem: Problem, values: Float[Array, "unknowns"]) -> tuple[Problem, Float[Array, "unknowns"]]:
     """The problem at the end of its iteration, its cameras at rest where they have come to, and its values there."""
     model = problem.unknowns.insert(problem.model, problem.unknowns.split(values, problem.model))
@@ -301,10 +291,18 @@ def _counted(chosen: Unknowns, model: ExposedModel, which: np.ndarray) -> tuple[
     return tuple((name, int(part.sum())) for name, part in zip(chosen.names, parts, strict=True) if part.any())
 
 
+def _held_out(held_out: tuple[Any, ...], behind: Any) -> tuple[Sequence[AbstractCamera], Targets, Lights | None]:
+    """Cameras, targets and lights of views that take no part."""
+    cameras, images, *rest = held_out
+    lights = lights_of(rest[0] if rest else None, cameras, "held-out view")
+    return cameras, targets_of(cameras, images, None, behind, "held-out image"), lights
+
+
 def _compare(
-    found: ExposedModel, settings: Settings, cameras: Sequence[AbstractCamera], targets: Targets
+    found: ExposedModel, settings: Settings, cameras: Sequence[AbstractCamera], targets: Targets, lights: Lights | None
 ) -> tuple[tuple[float, float], ...]:
     """PSNR and SSIM of views that took no part in the fit."""
     exposure = 1.0 if found.exposure is None else float(found.exposure)
-    pictures = [exposure * np.asarray(render(found.scene, camera, settings).rgb) for camera in cameras]
+    scenes = [found.scene if lights is None else lit(found.scene, lights[i], i) for i in range(len(cameras))]
+    pictures = [exposure * np.asarray(render(*seen, settings).rgb) for seen in zip(scenes, cameras, strict=True)]
     return tuple((psnr(*pair), similarity(*pair)) for pair in zip(targets.marked(), pictures, strict=True))

@@ -279,7 +279,7 @@ def _check_views(lengths: Sequence[np.ndarray], scene: Scene, unknown: Collectio
     if blind:
         named = ", ".join(map(str, blind))
         warnings.warn(
-            f"cameras that see nothing of the volume, so that their images say nothing of it: {named}; {where}", stacklevel=4
+            f"cameras that see nothing of the volume, so that their images say nothing of it: {named}; {where}", stacklevel=5
         )
 
 

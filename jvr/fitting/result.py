@@ -8,6 +8,7 @@ import numpy as np
 
 from jvr.model.camera import AbstractCamera
 from jvr.model.scene import Scene
+from jvr.rendering.settings import Settings
 from jvr.types import Outcome
 
 # Radiance of 80 dB below white: kept samples are rounded to about as much.
@@ -70,7 +71,7 @@ class FitResult(NamedTuple):
     - `outcome`: how the iteration ended.
     - `exposure`: the fitted factor between rendered and target radiance, 1 where it was not asked for.
     - `stats`: `FitStats`.
-    - `cameras`: the fitted cameras, or those that were given.
+    - `cameras`: the fitted cameras, or those that were given; `settings`: those of the fit.
     """
 
     scene: Scene
@@ -82,6 +83,7 @@ class FitResult(NamedTuple):
     stats: FitStats
     information: np.ndarray | None = None
     cameras: tuple[AbstractCamera, ...] = ()
+    settings: Settings = Settings()
 
     @property
     def errors_by_name(self) -> dict[str, np.ndarray]:
@@ -107,7 +109,16 @@ class FitResult(NamedTuple):
             lines.append(f"{name}: {middle}{errors.size - known.size} of {errors.size} not determined by the images")
         lines += [f"{name}: {count} values continued from their neighbours" for name, count in self.stats.smoothed]
         lines += ["neighbouring residuals are alike: the model does not explain the images"] if self.stats.is_misfit else []
+        lines += _one_more_view(self)
         return f"<div>{'<br>'.join(map(escape, lines))}{self.scene.transfer._repr_html_()}</div>"
+
+
+def _one_more_view(result: FitResult) -> list[str]:
+    """What the best of default candidates would bring, of a fit with few unknowns."""
+    from jvr.fitting.next_view import best_of, in_words
+
+    best = best_of(result)
+    return [] if best is None else [in_words(best)]
 
 
 def _poses_in_words(errors: dict[str, np.ndarray]) -> list[str]:

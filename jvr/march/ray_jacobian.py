@@ -118,7 +118,8 @@ def _segment(medium: Medium, dt: Scalar, back: BackwardRays, cotangents: tuple[M
 
     def added(cotangent: Marched, total: Rays) -> Rays:
         of_emitted, of_dtau, _ = segment_cotangents(cotangent, state.suffix, before, dtau, u)
-        chain = lambda by: sum(g * x for g, x in zip((*of_emitted, *of_dtau), (*by[0], *by[1]), strict=True))
+        products = lambda by: [g * x for g, x in zip((*of_emitted, *of_dtau), (*by[0], *by[1]), strict=True)]
+        chain = lambda by: sum(products(by), jnp.zeros_like(u))
         of_s, of_extent = where_known((sample,), (chain(by_s), chain(by_extent)))
         entry = tuple(t + of_s * g for t, g in zip(total.entry, slope, strict=True))
         direction = tuple(t + u * of_s * g for t, g in zip(total.direction, slope, strict=True))

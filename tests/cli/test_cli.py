@@ -164,7 +164,7 @@ def test_a_write_protected_output_is_refused_before_work(tmp_path, capsys, monke
 def test_help_shows_examples(capsys):
     assert cli.run([]) == 0
     assert "render" in capsys.readouterr().out
-    for command in ("render", "fit", "plan", "info", "demo", "preset"):
+    for command in ("render", "fit", "next-view", "plan", "info", "demo", "preset"):
         assert cli.run([command, "--help"]) == 0
         assert f"jvr {command}" in capsys.readouterr().out.split("Examples")[1]
 

@@ -82,7 +82,9 @@ def plain_program():
     return program(scene())
 
 
-@pytest.mark.parametrize("names", [*[(n,) for n in (*EFFECTS, *ENVIRONMENT)], *PAIRS])
+@pytest.mark.parametrize(
+    "names", [*[(n,) for n in (*EFFECTS, *ENVIRONMENT)], *(pytest.param(p, marks=pytest.mark.slow) for p in PAIRS)]
+)
 def test_an_effect_is_in_the_program_only_where_the_scene_holds_it(names):
     """Plans and programs differ from the plain one by what is named; taking the effects out again restores both."""
     parts = functools.reduce(lambda a, b: a | b, [(EFFECTS | ENVIRONMENT)[name]() for name in names], dict(LIGHT))

@@ -28,7 +28,7 @@ def scene_of(seed, dtype=np.uint8, shape=(9, 7, 8)):
     return jvr.Scene(jvr.Volume(values, slope=1 / 255), lut_transfer(), background=(0.2, 0.1, 0.3))
 
 
-@pytest.mark.parametrize(("width", "height", "tile"), [(16, 13, 40), (5, 2, 1), (1, 1, 1)])
+@pytest.mark.parametrize(("width", "height", "tile"), [(16, 13, 40), (5, 2, 1), pytest.param(1, 1, 1, marks=pytest.mark.slow)])
 def test_tiles_make_the_picture_of_one_piece(width, height, tile):
     """Numbers of blocks that tiles do not divide, and tiles of less than a block."""
     scene, camera = scene_of(0), perspective(jvr.Volume(np.zeros((9, 7, 8))), width, height)

@@ -71,7 +71,7 @@ def close(found: jvr.Rendering, expected: jvr.Rendering, name: str):
         np.testing.assert_allclose(getattr(found, part), getattr(expected, part), rtol=0, atol=1e-5, err_msg=name)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["bricked", "graded", pytest.param("packed", marks=pytest.mark.slow)])
 def test_pictures_after_a_replacement_are_those_of_a_scene_made_anew(kind):
     """With concrete arrays, and where the scene is an argument of a compiled function."""
     check_pictures(kind, lambda name: "another" not in name)

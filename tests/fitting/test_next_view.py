@@ -20,23 +20,30 @@ def known() -> jvr.FitResult:
     return jvr.fit(TRUTH, CAMERAS[:1], noisy, unknowns=both, settings=SETTINGS, max_steps=3, smooth_undetermined=False)
 
 
-def _dense(scene: jvr.Scene, camera: jvr.PerspectiveCamera) -> np.ndarray:
-    """`J^T J` of a view in float64."""
+def _dense(scene: jvr.Scene, camera: jvr.PerspectiveCamera, every: int = 1) -> np.ndarray:
+    """`J^T J` of a view in float64, of the middle one of `every` pixels in rows and columns, as many times as it stands for others."""
     with jax.enable_x64(True):
         scene, camera = jax.tree.map(lambda x: jnp.asarray(x, float), (scene, camera))
         settings = jvr.Settings(SETTINGS.step, termination=SETTINGS.termination, adjoint=jvr.Forward())
         picture = lambda table: jvr.render(eqx.tree_at(both, scene, table), camera, settings).rgb
         parts = jax.jit(jax.jacfwd(picture))(both(scene))
         rows = np.concatenate([np.reshape(part, (3 * camera.height * camera.width, -1)) for part in parts], axis=1)
-    return rows.T @ rows
+    pixels = [np.minimum(np.arange(every // 2, n + every // 2, every), n - 1) for n in (camera.height, camera.width)]
+    taken = rows.reshape(camera.height, camera.width, 3, -1)[np.ix_(*pixels)]
+    rows = taken.reshape(-1, rows.shape[1])
+    return rows.T @ rows * (camera.height * camera.width / taken[..., 0, 0].size)
+
+
+def _plausible(scene: jvr.Scene) -> np.ndarray:
+    rgb, sigma_t = (np.asarray(x, float) for x in both(scene))
+    return np.concatenate([np.ones(rgb.size), np.maximum(sigma_t, 0.1 / 0.9)])
 
 
 def test_gains_and_errors_are_those_of_dense_rows(known):
     """Colours may be uncertain by 1, extinctions by their value or by 0.1 over the smallest voxel, 0.9."""
-    rgb, sigma_t = (np.asarray(x, float) for x in both(known.scene))
-    size = np.concatenate([np.ones(rgb.size), np.maximum(sigma_t, 0.1 / 0.9)])
+    rgb, _ = both(known.scene)
     variance = known.stats.residual_variance
-    prior = np.diag(size**-2.0)
+    prior = np.diag(_plausible(known.scene) ** -2.0)
     before = _dense(known.scene, CAMERAS[0]) / variance + prior
     ranked = jvr.next_view(known, CANDIDATES, SETTINGS)
     assert sorted(candidate.number for candidate in ranked) == [0, 1, 2, 3]
@@ -59,6 +66,42 @@ def test_a_view_from_afar_brings_little_and_one_of_nothing_is_named(known):
     first, last = jvr.next_view(known, [small, CANDIDATES[0]], SETTINGS)
     assert (first.number, last.number) == (1, 0)
     assert 0 < last.gain < first.gain
+
+
+def test_views_from_all_around_are_compared_by_default(known):
+    """As far away as the camera of the fit, with its lens."""
+    ranked = jvr.next_view(known)
+    assert len(ranked) == 32
+    eyes = np.array([np.asarray(one.camera.world_from_camera)[:3, 3] for one in ranked])
+    center = np.asarray(VOLUME.center)
+    np.testing.assert_allclose(np.linalg.norm(eyes - center, axis=1), 30.0, rtol=1e-5)
+    # Spread over the sphere: their mean is its centre.
+    assert np.linalg.norm(np.mean(eyes, axis=0) - center) < 1.5
+    assert {(one.camera.width, one.camera.height, float(one.camera.fov_y)) for one in ranked} == {(16, 15, 30.0)}
+    best, last = ranked[0], ranked[-1]
+    assert best.gain > last.gain > 0
+    assert all(np.all(best.errors[name] <= best.before[name]) for name in known.unknowns)
+    words = known._repr_html_()
+    assert f"would bring {best.gain:.1f} bits" in words
+    assert f"transfer.sigma_t {np.median(best.before['transfer.sigma_t']):.2g}" in words
+
+
+@pytest.mark.slow
+def test_few_pixels_stand_for_their_neighbours(known):
+    """Every second one of each row and column."""
+    prior, variance = np.diag(_plausible(known.scene) ** -2.0), known.stats.residual_variance
+    before = _dense(known.scene, CAMERAS[0]) / variance + prior
+    for one in jvr.next_view(known, CANDIDATES[:2], SETTINGS, pixels=33):
+        after = before + _dense(known.scene, one.camera, every=2) / variance
+        bits = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]) / np.log(2)
+        np.testing.assert_allclose(one.gain, bits, rtol=1e-3)
+
+
+def test_values_outside_of_their_range_are_no_starts(known):
+    """As a fit with transforms of its own leaves them."""
+    bright = eqx.tree_at(lambda s: s.transfer.rgb, known.scene, 3 * known.scene.transfer.rgb)
+    (best,) = jvr.next_view(known._replace(scene=bright), CANDIDATES[:1], SETTINGS)
+    assert best.gain > 0
 
 
 @pytest.mark.slow
@@ -93,6 +136,10 @@ def test_exposure_counts_among_the_unknowns():
 def test_what_cannot_be_ranked_is_named(known):
     with pytest.raises(ValueError, match="no candidates"):
         jvr.next_view(known, [])
+    with pytest.raises(ValueError, match="no cameras of a fit to go by"):
+        jvr.next_view(known._replace(cameras=()))
+    with pytest.raises(ValueError, match="pixels must be at least 1"):
+        jvr.next_view(known, CANDIDATES, pixels=0)
     with pytest.raises(ValueError, match="too many unknowns"):
         jvr.next_view(known._replace(information=None), CANDIDATES)
 

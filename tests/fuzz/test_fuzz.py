@@ -1,10 +1,10 @@
-"""Two hundred damaged files of each format: each is read or refused in one line, soon, in little memory, with nothing on the terminal."""
+"""A hundred damaged files of each format: each is read or refused in one line, soon, in little memory, with nothing on the terminal."""
 
 import pytest
 from parent import findings
 from seeds import all_seeds
 
-COUNT = 200
+COUNT = 100
 
 
 @pytest.fixture(scope="module")

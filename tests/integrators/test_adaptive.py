@@ -62,7 +62,7 @@ def random_like(tree, seed=1):
 # -- in the image plane
 
 
-@pytest.mark.parametrize("size", [(45, 38), (1, 1), (5, 3), (2, 17)])
+@pytest.mark.parametrize("size", [(45, 38), (5, 3), *(pytest.param(size, marks=pytest.mark.slow) for size in ((1, 1), (2, 17)))])
 def test_no_tolerance_traces_every_ray(size):
     s = scene()
     every, refined = (render(s, view(s, *size), sampled(way)) for way in (jvr.Uniform(), jvr.Refinement(0, tile=4)))
@@ -265,6 +265,7 @@ def full():
     return render(s, view(s), on_slices(0))
 
 
+@pytest.mark.slow
 def test_all_samples_are_those_of_pre_integration():
     """An orthographic camera in front of a face: every ray enters on the first slice, so samples are where `jvr.Uniform()` has them."""
     s = scene()

@@ -334,7 +334,7 @@ def test_a_fit_of_light_starts_where_it_is_told_to():
         ("fit.initial={scatering={albedo=0}}", "fit.initial.scatering.albedo: unknown key; did you mean 'scattering'?"),
         ("fit.initial={scattering={albedo=2}}", "fit.initial: scattering.albedo: must be in [0, 1]"),
         ("fit.initial={lights={3={intensity=2}}}", "fit.initial: lights.3.intensity: '3' must be an index from 0 to 0"),
-        ("fit.initial={volume={packed=true}}", "fit.initial.volume.packed: unknown key; known: lights"),
+        ("fit.initial={volume={packed=true}}", "fit.initial.volume.packed: unknown key; known: camera, lights"),
     ],
 )
 def test_mistakes_about_unknown_light_are_named(change, hint):
@@ -347,3 +347,29 @@ def test_a_lit_configuration_renders():
     picture = jvr.render(scene, camera, jvr.Settings(4.0))
     assert bool(jnp.all(jnp.isfinite(picture.rgb)))
     assert float(picture.rgb.max()) > 0.0
+
+
+EACH = FIT.replace('phase = "isotropic"', 'phase = "isotropic"\n[fit]\nunknowns = ["scattering.albedo"]\n').replace(
+    "[camera]", '[camera]\nkind = "orbit"\ncount = 2'
+)
+ENDS = "fit.lights=[{kind='directional',direction=[1,0,0]},[{kind='head'},{kind='ambient',radiance=0.5}]]"
+
+
+def test_each_view_of_a_fit_may_have_lights_of_its_own():
+    """The targets are rendered under them; views beyond those of [camera] have the scene's."""
+    job = build_fit(config(EACH, ENDS, "fit.held_out=[0]"))
+    assert same(job.keywords["lights"], ((jvr.HeadLight(), jvr.AmbientLight(0.5)),))
+    assert job.held_out is not None
+    _, images, lights = job.held_out
+    assert same(lights, ((jvr.DirectionalLight([1, 0, 0]),),))
+    elsewhere = build_fit(config(EACH, "fit.held_out=[0]"))
+    assert len(elsewhere.held_out) == 2
+    assert elsewhere.keywords["lights"] is None
+    assert not np.allclose(images[0], elsewhere.held_out[1][0], rtol=0.1)
+    extra = build_fit(config(EACH, ENDS, "fit.held_out=1"))
+    assert same(extra.held_out[2], (extra.scene.lights,))
+
+
+def test_lights_of_views_are_as_many_as_the_cameras():
+    assert "fit.lights: 2 entries for 3 cameras" in refusal(build_fit, EACH, ENDS, "camera.count=3")
+    assert "fit.lights[1][0].kind: unknown choice" in refusal(build_fit, EACH, "fit.lights=['head',[{kind='haed'}]]")

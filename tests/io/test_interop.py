@@ -222,3 +222,49 @@ def test_derivatives_of_focal_lengths_and_principal_point(x64):
     x = jnp.array([7.0, 7.9, 2.8, 2.6])
     differences = [(loss(x.at[k].add(1e-6)) - loss(x.at[k].add(-1e-6))) / 2e-6 for k in range(4)]
     np.testing.assert_allclose(jax.jit(jax.grad(loss))(x), differences, rtol=1e-4, atol=1e-6)
+
+
+VTK = {"position": EYE.tolist(), "focal_point": TARGET.tolist(), "view_up": UP.tolist()}
+
+
+def test_files_of_cameras_are_those_that_they_say(tmp_path):
+    """One or several of VTK, each with a size of its own, and those of other programs by their own readers."""
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps([VTK, {**VTK, "parallel_scale": 7.0, "width": 8, "height": 6}]))
+    first, second = interop.read_cameras(file, WIDTH, HEIGHT)
+    assert same_camera(first, interop.from_vtk(VTK, WIDTH, HEIGHT))
+    assert same_camera(second, interop.from_vtk({**VTK, "parallel_scale": 7.0}, 8, 6))
+    file.write_text(json.dumps(VTK))
+    (turned,) = interop.read_cameras(file, ras=True)
+    assert same_camera(turned, interop.from_vtk(VTK, 512, 512, ras=True))
+    frames = {"w": 9, "h": 7, "fl_x": 11.0, "frames": [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]}
+    file.write_text(json.dumps(frames))
+    (nerf,) = interop.read_cameras(file)
+    assert (nerf.width, nerf.height) == (9, 7)
+
+
+def same_camera(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    return all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "problem"),
+    [
+        ("a.txt", "", ".pvcc (ParaView, PyVista) and .json"),
+        ("a.json", "{", "no JSON"),
+        ("a.json", "[]", "holds no cameras"),
+        ("a.json", "[3]", "camera 0 must be an object"),
+        ("a.json", json.dumps([VTK, {"position": [0, 0, 1]}]), "camera 1: the camera has no focal_point"),
+        ("a.json", json.dumps({**VTK, "width": 0}), "camera 0: width"),
+        ("a.json", json.dumps({**VTK, "width": "x"}), "camera 0"),
+        ("a.pvcc", "<a/>", "not a camera of ParaView"),
+    ],
+)
+def test_what_is_no_file_of_cameras_is_one_line(tmp_path, name, text, problem):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(interop.CameraError) as caught:
+        interop.read_cameras(tmp_path / name)
+    assert problem in str(caught.value)
+    assert str(tmp_path / name) in str(caught.value)
+    assert "\n" not in str(caught.value)

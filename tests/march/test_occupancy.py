@@ -225,6 +225,7 @@ def test_the_jacobian_is_the_same(x64):
     assert colours.radiance_sigma == colours.tau_sigma == ()
 
 
+@pytest.mark.slow
 def test_forward_derivative_of_a_shadow_takes_empty_space_as_well(x64):
     """A medium of no extinction casts a shadow as soon as it has some; against float64 differences."""
     values = np.linspace(0, 1, 6)[:, None, None] * np.ones((6, 6, 6))

@@ -33,8 +33,14 @@ VOLUMES = {"NaN": lambda: jvr.Volume(constant()), "padding": stored, "packed": l
 QUADRATURES = {"midpoint": jvr.Midpoint(), "pre-integrated": jvr.PreIntegrated()}
 
 
-@pytest.mark.parametrize("quadrature", QUADRATURES)
-@pytest.mark.parametrize("kind", VOLUMES)
+@pytest.mark.parametrize(
+    ("kind", "quadrature"),
+    [
+        pytest.param(kind, quadrature, marks=pytest.mark.slow if quadrature != "midpoint" and kind != "NaN" else [])
+        for kind in VOLUMES
+        for quadrature in QUADRATURES
+    ],
+)
 def test_a_sample_with_a_missing_neighbour_is_empty(kind, quadrature):
     """A ray through 8 voxels' lengths of a constant medium: with one plane missing, two of them are empty."""
     settings = jvr.Settings(step=0.25, quadrature=QUADRATURES[quadrature])

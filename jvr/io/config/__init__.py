@@ -5,6 +5,7 @@ from jvr.io.config.build import build_cameras as build_cameras
 from jvr.io.config.build import build_fit as build_fit
 from jvr.io.config.build import build_scene as build_scene
 from jvr.io.config.build import build_settings as build_settings
+from jvr.io.config.build import build_start as build_start
 from jvr.io.config.build import build_volume as build_volume
 from jvr.io.config.build import interpolated as interpolated
 from jvr.io.config.errors import ConfigError as ConfigError

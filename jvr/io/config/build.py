@@ -10,12 +10,12 @@ import numpy as np
 from jvr.io.config.cameras import cameras_of
 from jvr.io.config.environment import Precompute, environment_parts, fit_scene, keeps_radiance_transfer, precomputed
 from jvr.io.config.errors import ConfigError, blame
-from jvr.io.config.light import graded, light_parts
+from jvr.io.config.light import graded, light_parts, lights_of_views
 from jvr.io.config.load import Config, started
 from jvr.io.config.parts import made
 from jvr.io.config.schema.transfer import TransferTable
-from jvr.io.config.schema.whole import FitTable, VolumeTable
-from jvr.io.config.targets import held_out_indices, views_in_files
+from jvr.io.config.schema.whole import FileTable, FitTable, VolumeTable
+from jvr.io.config.targets import Lights, Views, held_out_indices, views_in_files
 from jvr.io.config.transfers import build_transfer
 from jvr.io.config.unknowns import unknowns_of
 from jvr.model.camera import AbstractCamera, PerspectiveCamera, fibonacci_sphere
@@ -34,7 +34,7 @@ class FitJob(NamedTuple):
 
     - `scene`: where it starts; `cameras`, `targets`: of the views that take part; pixels that do not count are NaN.
     - `truth`: the transfer function that rendered the targets, `None` where they are files.
-    - `held_out`: cameras and images that take no part, `None` without any.
+    - `held_out`: cameras and images that take no part, and the lights of each where views have their own; `None` without any.
     - `keywords`: of `jvr.fit`: unknowns, solver, loss, priors, weights and so on.
     - `keeps_radiance_transfer`: whether the radiance transfer stays that of the start though the unknowns change it.
     """
@@ -43,7 +43,7 @@ class FitJob(NamedTuple):
     cameras: tuple[AbstractCamera, ...]
     targets: tuple[np.ndarray, ...]
     truth: AbstractTransfer | None
-    held_out: tuple[tuple[AbstractCamera, ...], tuple[np.ndarray, ...]] | None
+    held_out: tuple[Any, ...] | None
     keywords: dict[str, Any]
     keeps_radiance_transfer: bool = False
 
@@ -100,9 +100,35 @@ def build_cameras(config: Config, volume: Volume, transfer: AbstractTransfer | N
     cameras: list[AbstractCamera] = []
     for i, table in enumerate(config.tables.camera):
         key = f"camera[{i}]" if len(config.tables.camera) > 1 else "camera"
+        if isinstance(table, FileTable):
+            cameras.extend(_cameras_in(config, table, f"{key}.path"))
+            continue
         with blame(config.where(key), key):
             cameras.extend(cameras_of(table, volume, transfer))
     return tuple(cameras)
+
+
+def _cameras_in(config: Config, table: FileTable, key: str) -> tuple[AbstractCamera, ...]:
+    from jvr.io.interop.camera_files import read_cameras
+
+    with blame(config.where(key), key):
+        return read_cameras(config.find(table.path, key), table.width, table.height, ras=table.ras)
+
+
+def build_start(config: Config) -> tuple[Volume, tuple[AbstractCamera, ...], Scene]:
+    """The volume of a fit, its cameras, and the scene that it starts from, before anything is computed of that.
+
+    **Raises** `ConfigError` where there is no `[fit]`.
+    """
+    fit, volume = _fit(config), build_volume(config)
+    cameras = build_cameras(config, volume)
+    return volume, cameras, _scene(started(config), volume, _start_transfer(config, fit, volume))
+
+
+def _fit(config: Config) -> FitTable:
+    if config.tables.fit is None:
+        raise ConfigError(config.name, "fit", "missing; add a table [fit] that says what to find")
+    return config.tables.fit
 
 
 def build_fit(
@@ -114,30 +140,41 @@ def build_fit(
 
     **Raises** `ConfigError` where there is no `[fit]`, or something in it does not go together.
     """
-    fit, tables = config.tables.fit, config.tables
-    if fit is None:
-        raise ConfigError(config.name, "fit", "missing; add a table [fit] that says what to find")
-    volume, settings = build_volume(config), build_settings(config)
-    cameras = build_cameras(config, volume)
-    begun = started(config)
-    scene = _scene(begun, volume, _start_transfer(config, fit, volume))
-    scene, first = fit_scene(config, scene, precompute), scene
+    fit, tables, settings = _fit(config), config.tables, build_settings(config)
+    volume, cameras, first = build_start(config)
+    begun, scene = started(config), fit_scene(config, first, precompute)
+    lights, truth = lights_of_views(config, len(cameras)), None
+    believed = build_cameras(begun, volume)
     if tables.truth is None:
-        inside, outside = views_in_files(config, fit, build_cameras(begun, volume), read_image)
-        keywords = _all_keywords(config, fit, first, inside.cameras) | {"weights": inside.weights}
-        held_out = (outside.cameras, outside.images) if outside.cameras else None
-        return FitJob(scene, inside.cameras, inside.images, None, held_out, keywords, keeps_radiance_transfer(config))
-    truth = _transfer(config, tables.truth, volume, "truth")
-    true_scene = precompute(_scene(config, volume, truth))
-    picture = lambda camera: np.asarray(render(true_scene, camera, settings).rgb)
-    extra = _extra_cameras(config, fit, cameras, volume)
-    inside, outside = ([c for c, out in extra if out == which] for which in (False, True))
-    held_out = (tuple(outside), tuple(map(picture, outside))) if outside else None
-    # Where the fit believes them to be.
-    believed = _extra_cameras(begun, fit, build_cameras(begun, volume), volume)
-    start = tuple(camera for camera, out in believed if not out)
-    keywords = _all_keywords(config, fit, first, start)
-    return FitJob(scene, start, tuple(map(picture, inside)), truth, held_out, keywords, keeps_radiance_transfer(config))
+        inside, outside = views_in_files(config, fit, believed, lights, read_image)
+    else:
+        truth = _transfer(config, tables.truth, volume, "truth")
+        true_scene = precompute(_scene(config, volume, truth))
+        inside, outside = _rendered(true_scene, settings, _extra_cameras(config, fit, cameras, volume), lights)
+        # Where the fit believes them to be.
+        start = _extra_cameras(begun, fit, believed, volume)
+        inside = inside._replace(cameras=tuple(camera for camera, out in start if not out))
+    keywords = _all_keywords(config, fit, first, inside.cameras) | {"weights": inside.weights, "lights": inside.lights}
+    held_out = (
+        (outside.cameras, outside.images, *([] if outside.lights is None else [outside.lights])) if outside.cameras else None
+    )
+    return FitJob(scene, inside.cameras, inside.images, truth, held_out, keywords, keeps_radiance_transfer(config))
+
+
+def _rendered(
+    scene: Scene, settings: Settings, cameras: list[tuple[AbstractCamera, bool]], lights: Lights | None
+) -> tuple[Views, Views]:
+    """The views that take part and those that are held out, with pictures of a scene. Beyond the given views its own lights shine."""
+    from jvr.fitting.groups import lit
+
+    under = None if lights is None else (*lights, *[scene.lights] * (len(cameras) - len(lights)))
+    scenes = [scene if under is None else lit(scene, under[i], i) for i in range(len(cameras))]
+    pictures = [np.asarray(render(one, camera, settings).rgb) for one, (camera, _) in zip(scenes, cameras, strict=True)]
+    where = lambda out: [i for i, (_, held) in enumerate(cameras) if held == out]
+    of = lambda values, out: None if values is None else tuple(values[i] for i in where(out))
+    seen = [camera for camera, _ in cameras]
+    inside, outside = (Views(of(seen, out) or (), of(pictures, out) or (), None, of(under, out)) for out in (False, True))
+    return inside, outside
 
 
 def _builtin() -> Volume:

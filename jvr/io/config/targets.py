@@ -10,20 +10,24 @@ from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.load import Config
 from jvr.io.config.schema.whole import FitTable
 from jvr.model.camera import AbstractCamera
+from jvr.model.light import AbstractLight
 
 Cameras = tuple[AbstractCamera, ...]
+Lights = tuple[tuple[AbstractLight, ...], ...]
 
 
 class Views(NamedTuple):
-    """Cameras with an image and, where something weighs them, a weight for each pixel. Pixels without weight are NaN."""
+    """Cameras with an image and, where something weighs them, a weight for each pixel; their lights, where they are not the scene's. Pixels
+    without weight are NaN."""
 
     cameras: Cameras
     images: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray, ...] | None
+    lights: Lights | None = None
 
 
 def views_in_files(
-    config: Config, fit: FitTable, cameras: Cameras, read_image: Callable[..., np.ndarray] | None
+    config: Config, fit: FitTable, cameras: Cameras, lights: Lights | None, read_image: Callable[..., np.ndarray] | None
 ) -> tuple[Views, Views]:
     """The views that take part, and those that are held out.
 
@@ -50,8 +54,9 @@ def views_in_files(
     chosen = held_out_indices(config, fit.held_out, len(cameras))
     inside, outside = ([i for i in range(len(cameras)) if (i in chosen) == which] for which in (False, True))
     taken = lambda values, indices: tuple(values[i] for i in indices)
+    given = lambda values, indices: None if values is None else taken(values, indices)
     views = lambda indices: Views(
-        taken(cameras, indices), taken(images, indices), None if weights is None else taken(weights, indices)
+        taken(cameras, indices), taken(images, indices), given(weights, indices), given(lights, indices)
     )
     return views(inside), views(outside)
 

@@ -27,7 +27,7 @@ from jvr.io.kinds import KINDS
 from jvr.model import presets
 from jvr.model.gradient_transfer import GradientOpacity
 from jvr.model.parameters import declared
-from jvr.model.transfer import AbstractTransfer, LinearTransfer
+from jvr.model.transfer import AbstractTransfer, LinearTransfer, LutTransfer
 from jvr.model.volume import Volume
 from jvr.model.voxels import typical_range
 
@@ -82,6 +82,7 @@ def build_transfer(
                 found = read_transfer(file)
             case ImportedTable():
                 found = imported(table, volume, file).transfer
+                found = found if table.entries is None else resampled(found, table.entries)
             case PresetTable():
                 found = _preset(table, volume)
             case WindowTable():
@@ -111,6 +112,22 @@ def imported(table: ImportedTable, volume: Volume | None, file: Path | None) -> 
         return read_slicer(file, unit_distance=table.unit_distance, spacing=spacing, encoding=table.encoding)
     assert table.name is not None
     return slicer_preset(table.name, spacing=spacing, encoding=table.encoding)
+
+
+def resampled(transfer: AbstractTransfer, entries: int) -> LutTransfer:
+    """The points of a piecewise linear transfer function as a table of evenly spaced entries.
+
+    **Raises** `ValueError` for other kinds.
+    """
+    if not isinstance(transfer, LinearTransfer):
+        raise ValueError(
+            f"entries are of presets without opacity by gradient, this is a {type(transfer).__name__}: leave them out"
+        )
+    at, columns = np.asarray(transfer.positions), np.column_stack([np.asarray(transfer.rgb), np.asarray(transfer.sigma_t)])
+    x = np.linspace(at[0], at[-1], entries)
+    table = np.stack([np.interp(x, at, column) for column in columns.T], axis=1)
+    sigma_t = table[:, 3] if transfer.sigma_t.ndim == 1 else table[:, 3:]
+    return LutTransfer(table[:, :3], sigma_t, (at[0], at[-1]))
 
 
 def _preset(table: PresetTable, volume: Volume | None) -> AbstractTransfer:

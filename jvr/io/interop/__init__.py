@@ -1,5 +1,6 @@
 """Cameras and presets of other programs, none of which is imported: `from jvr.io import interop`."""
 
+from jvr.io.interop.camera_files import read_cameras as read_cameras
 from jvr.io.interop.cameras import CameraError as CameraError
 from jvr.io.interop.cameras import from_opencv as from_opencv
 from jvr.io.interop.cameras import from_paraview as from_paraview

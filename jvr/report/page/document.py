@@ -14,6 +14,7 @@ import numpy as np
 from jvr.atomic import replacing
 from jvr.model.transfer import AbstractTransfer
 from jvr.report.errors import field_errors
+from jvr.report.page.next_view import one_more_view
 from jvr.report.page.summary import identifiability, summary, verdict
 from jvr.report.page.values import camera_values, other_values, transfer_values
 from jvr.report.plots import comparison_strip, plot_convergence, plot_transfer, png
@@ -93,6 +94,7 @@ def write_fit_page(
         other_values(result.scene, result.errors_by_name),
         camera_values(result.cameras, result.errors_by_name),
         identifiability(result, transfer),
+        one_more_view(result),
         _convergence(result),
         _again(command, config_text, versions),
     ]

@@ -101,7 +101,8 @@ def _one_method(value: Any) -> Any:
     return value
 
 
-Lights = Annotated[list[Annotated[Any, part(AbstractLight)]], BeforeValidator(one_or_more), Field(validate_default=True)]
+OneOrMore = Annotated[list[Annotated[Any, part(AbstractLight)]], BeforeValidator(one_or_more)]
+Lights = Annotated[OneOrMore, Field(validate_default=True)]
 Shading = Annotated[Any, part(AbstractShading)]
 Shadows = Annotated[Any, part(AbstractShadows), BeforeValidator(_one_method)]
 Scattering = Annotated[Any, part(AbstractScattering, "single")]

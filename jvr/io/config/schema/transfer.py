@@ -121,10 +121,12 @@ def _slicer_name(value: Any) -> Any:
 
 
 class ImportedTable(TransferTable):
-    """A preset of another program: what its colours are, and the length that its opacities belong to."""
+    """A preset of another program: what its colours are, and the length that its opacities belong to; with `entries` as a table of so many,
+    evenly spaced from its first point to its last, which a fit can change between its points."""
 
     unit_distance: Length | None = None
     encoding: Literal["linear", "srgb"] = "linear"
+    entries: Annotated[int, whole("entries of the table", Interval(2, 65_536))] | None = None
 
 
 class SlicerTable(ImportedTable):

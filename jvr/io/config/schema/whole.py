@@ -8,8 +8,8 @@ from pydantic import BeforeValidator, Field, model_validator
 from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
 from jvr.io.config.schema.environment import Environments, Material, RadianceTransfer
-from jvr.io.config.schema.light import Lights, Normals, Scattering, Shading, Shadows, casts_shadows
-from jvr.io.config.schema.parts import BASES, KindTable, only, part
+from jvr.io.config.schema.light import Lights, Normals, OneOrMore, Scattering, Shading, Shadows, casts_shadows
+from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, only, part
 from jvr.io.config.schema.table import Colour, Extinction, Position, Range, Scalar, Table, one_or_more
 from jvr.io.config.schema.transfer import Transfer
 from jvr.io.kinds import maker_of
@@ -94,6 +94,23 @@ class RigTable(CameraTable):
         return self
 
 
+class FileTable(CameraTable):
+    """Cameras of other programs, in a file (`jvr.io.interop.read_cameras`)."""
+
+    path: str
+    width: Annotated[int, whole("pixels", Interval(1, 65_536))] | None = None
+    height: Annotated[int, whole("pixels", Interval(1, 65_536))] | None = None
+    ras: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> "FileTable":
+        for key in ("target", "frame"):
+            if key in self.model_fields_set:
+                raise problem("the file says where its cameras look: leave it out", key)
+        return self
+
+
+WRITTEN[AbstractCamera] = {"file": FileTable}
 BASES |= {AbstractCamera: SingleTable, (AbstractCamera, "fibonacci"): RigTable, (AbstractCamera, "orbit"): RigTable}
 Camera = Annotated[Any, part(AbstractCamera, "perspective")]
 Cameras = Annotated[list[Camera], BeforeValidator(one_or_more), Field(min_length=1, validate_default=True)]
@@ -161,7 +178,7 @@ LEAST_SQUARES = ("levenberg-marquardt", "gauss-newton", "dogleg")
 
 class FitTable(Table):
     """What `jvr.fit` finds, and how. Target images are files, read by `encoding`, `alpha` and `layer` (`jvr.read_image`) and weighted by
-    those of `weights`, or are rendered with the transfer function of `[truth]`."""
+    those of `weights`, or are rendered with the transfer function of `[truth]`. `lights`: those of each view, in place of the scene's."""
 
     unknowns: Annotated[list[str], Field(min_length=1)] = Field(default=["transfer.rgb", "transfer.sigma_t"])
     images: Annotated[list[str], Field(min_length=1)] | None = None
@@ -169,6 +186,7 @@ class FitTable(Table):
     alpha: Literal["straight", "associated", "ignored"] | None = None
     layer: str | None = None
     weights: Annotated[list[str], Field(min_length=1)] | None = None
+    lights: Annotated[list[OneOrMore], Field(min_length=1)] | None = None
     start: StartTable | None = None
     initial: dict[str, Any] = Field(default={})
     solver: Literal["levenberg-marquardt", "gauss-newton", "dogleg", "lbfgsb", "bfgs", "lbfgs", "adam"] = "levenberg-marquardt"
