@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from jvr.fitting.bijectors import Sigmoid as Sigmoid
     from jvr.fitting.bijectors import Softplus as Softplus
     from jvr.fitting.fit import fit as fit
+    from jvr.fitting.grids import fit_on_grids as fit_on_grids
     from jvr.fitting.initialise import colours_given_extinction as colours_given_extinction
     from jvr.fitting.initialise import flat_transfer as flat_transfer
     from jvr.fitting.least_squares import Dogleg as Dogleg
@@ -43,6 +44,10 @@ if TYPE_CHECKING:
     from jvr.fitting.residuals import residuals as residuals
     from jvr.fitting.result import FitResult as FitResult
     from jvr.fitting.unknowns import shared as shared
+    from jvr.fitting.voxel_errors import VoxelErrors as VoxelErrors
+    from jvr.fitting.voxel_errors import voxel_errors as voxel_errors
+    from jvr.fitting.voxel_priors import Tikhonov as Tikhonov
+    from jvr.fitting.voxel_priors import TotalVariation as TotalVariation
     from jvr.integrators.refinement import Refinement as Refinement
     from jvr.integrators.slices.oracle import BrickRange as BrickRange
     from jvr.integrators.slices.oracle import Finest as Finest

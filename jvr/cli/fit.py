@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import shlex
 import time
 import warnings
@@ -12,7 +13,19 @@ from typing import Any
 import numpy as np
 
 from jvr.cli.beforehand import Beforehand
-from jvr.cli.folder import CAMERAS, CHECKPOINT, KNOWLEDGE, PAGE, RESULT, TRANSFER, alone_in, check_results, results_in
+from jvr.cli.folder import (
+    CAMERAS,
+    CHECKPOINT,
+    CHECKPOINTS,
+    KNOWLEDGE,
+    PAGE,
+    RESULT,
+    TRANSFER,
+    VOLUME,
+    alone_in,
+    check_results,
+    results_in,
+)
 from jvr.cli.inputs import BadInput, Interrupted, inputs_of, reading, refused_by_jvr, warnings_as_lines
 from jvr.cli.runtime import nested, plain, progress, provenance, start_jax
 from jvr.cli.signals import INTERRUPTED, Terminated, said
@@ -20,6 +33,7 @@ from jvr.io.config import Config, FitJob, build_fit, write_transfer
 from jvr.io.config.cameras import write_cameras
 from jvr.io.config.parts import choices_of
 from jvr.io.knowledge import write_knowledge
+from jvr.io.volumes.written import write_metaimage
 from jvr.model.exact import in_double
 
 
@@ -68,12 +82,15 @@ def _about_the_kept_radiance_transfer(job: FitJob) -> Iterator[None]:
 
 def _fit(job: FitJob, checkpoint: Path, resume: bool) -> Any:
     from jvr.fitting.fit import fit
+    from jvr.fitting.grids import fit_on_grids
 
     keywords = dict(job.keywords, held_out=job.held_out, checkpoint=checkpoint, resume=resume)
     if not resume:
         checkpoint.unlink(missing_ok=True)
     try:
         with warnings_as_lines():
+            if job.levels > 1:
+                return fit_on_grids(job.scene, job.cameras, job.targets, levels=job.levels, **keywords)
             return fit(job.scene, job.cameras, job.targets, **keywords)
     except (KeyboardInterrupt, Terminated) as error:
         kept = f"{checkpoint} is kept, --resume goes on from it" if checkpoint.exists() else "no step was finished"
@@ -91,7 +108,7 @@ def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float,
     fitted = _pictures(result.scene, result.exposure, result.cameras, job, job.keywords["lights"])
     # Of another run: it may have had more views.
     for path in results_in(folder):
-        if path.name != CHECKPOINT:
+        if not re.fullmatch(CHECKPOINTS, path.name):
             path.unlink()
     for i, (target, found) in enumerate(zip(job.targets, fitted, strict=True)):
         _write_views(folder, f"{i:02d}", target, found)
@@ -100,6 +117,8 @@ def _write(config: Config, job: FitJob, result: Any, folder: Path, began: float,
     for i, (target, found) in enumerate(zip(held_targets, held_fitted, strict=True)):
         _write_views(folder, f"held_out_{i:02d}", target, found)
     write_transfer(folder / TRANSFER, result.scene.transfer)
+    if "volume.values" in result.unknowns:
+        write_metaimage(folder / VOLUME, result.scene.volume)
     write_cameras(folder / CAMERAS, result.cameras)
     write_knowledge(folder / KNOWLEDGE, config, result)
     report = _report(config, job, result, (fitted, held_fitted))
@@ -174,7 +193,8 @@ def _report(config: Config, job: FitJob, result: Any, pictures: Any) -> dict[str
         "views": _scores(job.targets, pictures[0]),
         "held_out": _scores(held_targets, pictures[1]),
         "history": [{name: plain(value) for name, value in entry._asdict().items()} for entry in result.history],
-        "standard_errors": {name: nested(array) for name, array in result.errors_by_name.items()},
+        # Of voxels there are none, and too many to say so of each.
+        "standard_errors": {name: None if np.isnan(a).all() else nested(a) for name, a in result.errors_by_name.items()},
         "rank": stats.rank,
         "condition": plain(stats.condition),
         "residual_variance": plain(stats.residual_variance),

@@ -10,9 +10,12 @@ from jvr.atomic import remove_parts
 from jvr.cli.inputs import BadInput
 
 CHECKPOINT, PAGE, RESULT, TRANSFER = "checkpoint.npz", "report.html", "result.json", "transfer.toml"
-CAMERAS, KNOWLEDGE, NEXT_VIEWS = "cameras.toml", "knowledge.npz", "next_views.png"
+CAMERAS, KNOWLEDGE, NEXT_VIEWS, VOLUME = "cameras.toml", "knowledge.npz", "next_views.png", "volume.mha"
+# Of a fit on several grids, those of the finer ones have a number.
+CHECKPOINTS = r"checkpoint(_\d+)?\.npz"
 PICTURES = r"(target|fitted|difference)_(held_out_)?\d{2,}\.(exr|png)"
-WRITTEN = re.compile("|".join([PICTURES, *map(re.escape, (CHECKPOINT, PAGE, RESULT, TRANSFER, CAMERAS, KNOWLEDGE, NEXT_VIEWS))]))
+NAMES = (PAGE, RESULT, TRANSFER, CAMERAS, KNOWLEDGE, NEXT_VIEWS, VOLUME)
+WRITTEN = re.compile("|".join([PICTURES, CHECKPOINTS, *map(re.escape, NAMES)]))
 
 
 def results_in(folder: Path) -> list[Path]:

@@ -19,7 +19,7 @@ from jvr.fitting.losses import DSSIM, SquaredError
 from jvr.fitting.normal_equations import LightTangents, Normal, light_tangents, normal_equations, prior_expansion, scored
 from jvr.fitting.objective import image_value, residuals, value
 from jvr.fitting.observations import Observations
-from jvr.fitting.problem import Problem
+from jvr.fitting.problem import Problem, prior
 from jvr.fitting.solvers import Functions, Limits
 from jvr.model.camera import AbstractCamera
 from jvr.model.ranges import UnitVector
@@ -146,12 +146,12 @@ class Evaluator:
         return fixed
 
     def psnr(self, unconstrained: np.ndarray, loss: float, normal: Normal | None) -> float:
-        """Decibels relative to radiance 1. Where neither the objective nor what a solver knows is the mean squared error, that costs
-        a march of its own."""
+        """Decibels relative to radiance 1. Where the objective is neither the mean squared error, but for priors, nor what a solver knows,
+        that costs a march of its own."""
         if normal is not None:
             mean = float(normal.squares)
-        elif isinstance(self.problem.loss, SquaredError) and not self.problem.priors:
-            mean = loss
+        elif isinstance(self.problem.loss, SquaredError):
+            mean = loss - (float(_prior_value(self.problem, jnp.asarray(unconstrained))) if self.problem.priors else 0.0)
         else:
             at, total = jnp.asarray(unconstrained), jnp.asarray(self.sums[-1].residuals)
             each = [_mean_squares(g.problem.least_squares(), at, g.observations, total) for g in self.groups]
@@ -237,6 +237,11 @@ def _levels(groups: tuple[Group, ...]) -> tuple[int, ...]:
 
 
 _mean_squares = eqx.filter_jit(value)
+
+
+@eqx.filter_jit
+def _prior_value(problem: Problem, unconstrained: Array) -> Any:
+    return prior(problem, problem.unknowns.model_from_unconstrained(problem.model, unconstrained))
 
 
 @eqx.filter_jit

@@ -14,6 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from jvr.fitting import coarse
+from jvr.fitting.bijectors import Bounded
 from jvr.fitting.checkpoint import fingerprint
 from jvr.fitting.continuation import continued
 from jvr.fitting.descent import Checkpoint, Descent
@@ -215,6 +216,11 @@ def _choose(
     model: ExposedModel, cameras: tuple[AbstractCamera, ...], unknowns: Any, transforms: Any, solver: AbstractSolver
 ) -> Unknowns:
     if transforms is not None:
+        if solver.bounds is None and any(isinstance(t, Bounded) for t in transforms):
+            raise ValueError(
+                f"{type(solver).__name__} knows no bounds, which jvr.Bounded(low, high) needs: use solver=jvr.LBFGSB(), or "
+                "transforms=jvr.Sigmoid(low, high) in its place"
+            )
         transforms = (*transforms, *([None] if model.exposure is not None else []))
     return choose_unknowns(model, _select(unknowns, cameras), transforms, solver.bounds)
 
@@ -258,7 +264,7 @@ def _check(problem: Problem, solver: AbstractSolver, given: Targets, coarse_leve
     if is_least_squares and inner > MOST_FORWARD:
         raise ValueError(
             f"{inner:,} unknowns are too many for a least-squares solver (at most {MOST_FORWARD} beside a table's entries): "
-            "use solver=optimistix.LBFGS(rtol=1e-6, atol=1e-8)"
+            "use solver=optimistix.LBFGS(rtol=1e-6, atol=1e-8), or jvr.LBFGSB() within bounds"
         )
     return is_least_squares
 
@@ -277,6 +283,8 @@ def _least_determined(
     chosen: Unknowns, model: ExposedModel, known: Identifiability, most: int = 6
 ) -> tuple[tuple[str, float], ...]:
     """The largest coefficients of the least-determined direction, with the names of their unknowns."""
+    if not np.isfinite(known.least_determined).all():
+        return ()
     labels = []
     for name, array in zip(chosen.names, chosen.values(model), strict=True):
         labels += [f"{name}[{', '.join(map(str, i))}]" for i in np.ndindex(array.shape)]

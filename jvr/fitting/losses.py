@@ -89,7 +89,7 @@ class AbstractPrior(eqx.Module):
 
     @abc.abstractmethod
     def value(self, scene: Scene) -> Scalar:
-        """The penalty; convex in the transfer function's values."""
+        """The penalty; convex in the entries or the voxels that it is about."""
 
 
 class ColourSmoothness(AbstractPrior):

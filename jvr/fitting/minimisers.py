@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -18,7 +19,9 @@ from jvr.types import Outcome
 
 class Scaled(eqx.Module):
     """An objective times a factor. Quasi-Newton methods leave out updates whose curvature is under the rounding of float32, which a
-    mean over pixels starts out with; scaled by `unknowns / objective` at the start, a step of one changes it by about itself."""
+    mean over pixels starts out with; scaled by `unknowns / objective` at the start, a step of one changes it by about itself. Where most
+    unknowns are hardly seen, as voxels are, a first step along its gradient would still promise less than nothing: it is scaled by
+    `objective / |gradient|^2` at most, by which that step ends at zero (Polyak 1969)."""
 
     function: Any
     factor: Array
@@ -29,14 +32,13 @@ class Scaled(eqx.Module):
 
 
 @eqx.filter_jit
-def _factor(function: Any, unconstrained: Array) -> Array:
-    loss, _ = function(unconstrained, None)
-    return jnp.where(loss > 0, unconstrained.size / jnp.where(loss > 0, loss, 1.0), 1.0)
-
-
-@eqx.filter_jit
-def _value(function: Any, unconstrained: Array) -> Array:
-    return function(unconstrained, None)[0]
+def _start(function: Any, unconstrained: Array) -> tuple[Array, Array]:
+    """The objective, and its factor."""
+    loss, gradient = jax.value_and_grad(lambda x: function(x, None)[0])(unconstrained)
+    squared = jnp.sum(jnp.square(gradient))
+    known = (loss > 0) & (squared > 0)
+    factor = jnp.minimum(unconstrained.size / jnp.where(known, loss, 1.0), loss / jnp.where(known, squared, 1.0))
+    return loss, jnp.where(known & jnp.isfinite(factor) & (factor > 0), factor, 1.0)
 
 
 class GradientState(NamedTuple):
@@ -87,7 +89,7 @@ class OptimistixSolver(AbstractGradientSolver):
 
     def init(self, functions: Functions, unconstrained: Float[Array, "n"]) -> GradientState:
         whole = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
-        factor = jnp.ones(()) if whole else _factor(functions.value, unconstrained)
+        factor = jnp.ones(()) if whole else _start(functions.value, unconstrained)[1]
         return _begin(unconstrained, _init(self.solver, self._function(functions, factor), unconstrained), factor)
 
     def step(self, functions: Functions, state: GradientState) -> GradientState:
@@ -136,11 +138,11 @@ class LBFGSB(AbstractGradientSolver):
     def init(self, functions: Functions, unconstrained: Float[Array, "n"]) -> GradientState:
         bounds = _bounds(functions, unconstrained)
         unconstrained = jnp.clip(unconstrained, *bounds)
-        factor = _factor(functions.value, unconstrained)
+        loss, factor = _start(functions.value, unconstrained)
         scaled = Scaled(functions.value, factor)
         state = _begin(unconstrained, _bounded_init(self.tol, self.history, scaled, unconstrained, bounds), factor)
         # Its first step may end at a worse point: the start counts as one that it has accepted.
-        return state._replace(best_loss=_value(scaled, unconstrained))
+        return state._replace(best_loss=loss * factor)
 
     def step(self, functions: Functions, state: GradientState) -> GradientState:
         scaled = Scaled(functions.value, state.factor)

@@ -63,8 +63,9 @@ class FitResult(NamedTuple):
     - `scene`: the fitted scene.
     - `history`: one `Iteration` for each step.
     - `standard_errors`: of every fitted value, in the structure of what `unknowns` returned; infinite where the images do not determine
-      it, NaN for more unknowns than a Gauss-Newton matrix is made for (voxels). Of a pose six: a rotation about the centre of the volume,
-      in degrees about the x, y and z axes of the world, and a translation of it along these, as a world length (mm).
+      it, NaN for more unknowns than a Gauss-Newton matrix is made for (those of voxels come from `jvr.voxel_errors`). Of a pose six: a
+      rotation about the centre of the volume, in degrees about the x, y and z axes of the world, and a translation of it along these, as
+      a world length (mm).
     - `unknowns`: the paths of the fitted arrays, such as `transfer.rgb` or `cameras[0].fov_y`, in the order of `standard_errors`.
     - `information`: the inverse of the covariance of all fitted values, one after the other, as plain noise would have it, `(n, n)`; `None`
       where there are too many. `jvr.next_view` reads it.

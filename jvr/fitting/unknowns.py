@@ -17,6 +17,7 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.parameters import is_by_channel, is_ordered, parameter, range_at
 from jvr.model.ranges import NOT_NEGATIVE, Entries, Interval, Range
 from jvr.model.scene import Scene
+from jvr.model.transfer import AbstractTable
 from jvr.types import Scalar
 
 # An extinction may plausibly be so much over one voxel at least.
@@ -67,7 +68,7 @@ class Unknowns(eqx.Module):
     def among(self, model: ExposedModel, select: Callable[[ExposedModel], Any]) -> frozenset[int]:
         """Which of the unknown arrays, counted from 0, are leaves of the parts that `select` picks out of the model; what these parts
         compute of leaves is none of them."""
-        selected = {index for group in _leaf_indices(model, select) for index in group}
+        selected = _among_leaves(model, select)
         return frozenset(i for i, index in enumerate(self.indices) if index in selected)
 
     def values(self, model: ExposedModel) -> list[Float[Array, "..."]]:
@@ -157,7 +158,10 @@ def choose_unknowns(
     for name, index in zip(names, indices, strict=True):
         if not eqx.is_inexact_array(leaves[index][1]):
             kind = jnp.asarray(leaves[index][1]).dtype
-            raise ValueError(f"{name} holds integers ({kind}), which have no derivative: convert them to floating point first")
+            raise ValueError(
+                f"{name} holds integers ({kind}), which have no derivative: convert them to floating point first, as "
+                "dataclasses.replace(volume, values=volume.values.astype(float)) does"
+            )
     given = (None,) * len(indices) if transforms is None else tuple(transforms)
     if len(given) != len(indices):
         raise ValueError(
@@ -173,12 +177,33 @@ def choose_unknowns(
         if _is_motion(leaves[index][0]):
             return Motion(model.scene.volume.radius)
         _check_start(name, leaves[index][1], declared)
+        if bounds is not None and {index} == _among_leaves(model, lambda m: m.scene.volume.values):
+            declared = _range_of_voxels(model, indices) or declared
         return bijector_of(declared, leaves[index][1], voxel, bounds)
 
     ranges = tuple(range_at(model, leaves[i][0]) for i in indices)
     by_channel, ordered = (tuple(told(model, leaves[i][0]) for i in indices) for told in (is_by_channel, is_ordered))
     chosen = tuple(t or default(*known) for t, known in zip(given, zip(names, indices, ranges, strict=True), strict=True))
     return Unknowns(indices, twins, names, ranges, by_channel, ordered, chosen)
+
+
+def _among_leaves(model: ExposedModel, select: Callable[[ExposedModel], Any]) -> set[int | None]:
+    """Where leaves that `select` picks out are in the model's list."""
+    return {index for group in _leaf_indices(model, select) for index in group}
+
+
+def _range_of_voxels(model: ExposedModel, indices: tuple[int, ...]) -> Interval | None:
+    """What stored voxels may be: beyond the ends of a table all look as they do there, and no picture would pull one back. `None` where
+    there are no ends, or where what maps them to voxels is unknown itself."""
+    transfer, volume = model.scene.transfer, model.scene.volume
+    if not isinstance(transfer, AbstractTable):
+        return None
+    of_table: Any = lambda m: (m.scene.transfer.rgb, m.scene.transfer.sigma_t)
+    placed = _among_leaves(model, lambda m: (m.scene.transfer, m.scene.volume.slope, m.scene.volume.intercept))
+    if set(indices) & (placed - _among_leaves(model, of_table)):
+        return None
+    low, high = sorted(float((end - volume.intercept) / volume.slope) for end in transfer.ends)
+    return Interval(low, high)
 
 
 def takes_cameras(unknowns: Any) -> bool:

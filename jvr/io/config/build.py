@@ -13,6 +13,7 @@ from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.light import graded, light_parts, lights_of_views
 from jvr.io.config.load import Config, started
 from jvr.io.config.parts import made
+from jvr.io.config.priors import priors_of, start_voxels, transforms_of
 from jvr.io.config.schema.transfer import TransferTable
 from jvr.io.config.schema.whole import FileTable, FitTable, VolumeTable
 from jvr.io.config.targets import Lights, Views, held_out_indices, views_in_files
@@ -37,6 +38,7 @@ class FitJob(NamedTuple):
     - `held_out`: cameras and images that take no part, and the lights of each where views have their own; `None` without any.
     - `keywords`: of `jvr.fit`: unknowns, solver, loss, priors, weights and so on.
     - `keeps_radiance_transfer`: whether the radiance transfer stays that of the start though the unknowns change it.
+    - `levels`: on how many grids the voxels are found (`jvr.fit_on_grids`).
     """
 
     scene: Scene
@@ -46,6 +48,7 @@ class FitJob(NamedTuple):
     held_out: tuple[Any, ...] | None
     keywords: dict[str, Any]
     keeps_radiance_transfer: bool = False
+    levels: int = 1
 
 
 def build_settings(config: Config) -> Settings:
@@ -122,7 +125,7 @@ def build_start(config: Config) -> tuple[Volume, tuple[AbstractCamera, ...], Sce
     """
     fit, volume = _fit(config), build_volume(config)
     cameras = build_cameras(config, volume)
-    return volume, cameras, _scene(started(config), volume, _start_transfer(config, fit, volume))
+    return volume, cameras, _scene(started(config), start_voxels(fit, volume), _start_transfer(config, fit, volume))
 
 
 def _fit(config: Config) -> FitTable:
@@ -158,7 +161,8 @@ def build_fit(
     held_out = (
         (outside.cameras, outside.images, *([] if outside.lights is None else [outside.lights])) if outside.cameras else None
     )
-    return FitJob(scene, inside.cameras, inside.images, truth, held_out, keywords, keeps_radiance_transfer(config))
+    levels = 1 if fit.voxels is None else fit.voxels.levels
+    return FitJob(scene, inside.cameras, inside.images, truth, held_out, keywords, keeps_radiance_transfer(config), levels)
 
 
 def _rendered(
@@ -241,7 +245,12 @@ def _start(config: Config, volume: Volume) -> AbstractTransfer:
 
 def _all_keywords(config: Config, fit: FitTable, scene: Scene, cameras: tuple[AbstractCamera, ...]) -> dict[str, Any]:
     """Keywords of `jvr.fit` for a scene before anything was computed for it."""
-    return {**_keywords(config, fit), "unknowns": unknowns_of(config, fit, scene, cameras), "settings": build_settings(config)}
+    keywords = {
+        **_keywords(config, fit),
+        "unknowns": unknowns_of(config, fit, scene, cameras),
+        "settings": build_settings(config),
+    }
+    return keywords | {"transforms": transforms_of(fit, scene.volume)}
 
 
 def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:
@@ -256,7 +265,7 @@ def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:
     return {
         "solver": _solver(fit),
         "loss": losses[fit.loss](),
-        "priors": _priors(config, fit),
+        "priors": priors_of(fit),
         "exposure": fit.exposure,
         "keep_samples": fit.keep_samples,
         "smooth_undetermined": fit.smooth_undetermined,
@@ -282,14 +291,6 @@ def _solver(fit: FitTable) -> Any:
         return optx.OptaxMinimiser(optax.adam(fit.learning_rate), rtol=rtol, atol=rtol)
     quasi_newton = {"bfgs": optx.BFGS, "lbfgs": optx.LBFGS}[fit.solver]
     return quasi_newton(rtol=rtol, atol=1e-2 * rtol)
-
-
-def _priors(config: Config, fit: FitTable) -> tuple[Any, ...]:
-    from jvr.fitting.losses import ColourSmoothness, ExtinctionSmoothness, Sparsity
-
-    kinds = {"colour_smoothness": ColourSmoothness, "extinction_smoothness": ExtinctionSmoothness, "sparsity": Sparsity}
-    strengths = {name: getattr(fit.priors, name) for name in kinds}
-    return tuple(kinds[name](strength) for name, strength in strengths.items() if strength)
 
 
 def _extra_cameras(

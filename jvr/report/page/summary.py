@@ -54,15 +54,14 @@ def summary(result: "FitResult", targets: Sequence[Any], fitted: Sequence[Any]) 
     if held_out := _held_out(result):
         views, psnr, ssim = held_out
         tiles += [("PSNR, held-out views", psnr, f"mean of {views}"), ("SSIM, held-out views", ssim, f"mean of {views}")]
-    tiles += [
-        ("residual", f"{np.sqrt(stats.residual_variance):.2g}", "radiance, root mean square of a channel"),
-        ("rank", f"{stats.rank} of {count}", "combinations of unknowns that the images determine"),
-        (
-            "kept samples",
-            memory(stats.kept_bytes),
-            "volume values along the rays" if stats.kept_bytes else "resampled in every step",
-        ),
-    ]
+    tiles += []
+    if not np.isnan(stats.condition):
+        tiles += [
+            ("residual", f"{np.sqrt(stats.residual_variance):.2g}", "radiance, root mean square of a channel"),
+            ("rank", f"{stats.rank} of {count}", "combinations of unknowns that the images determine"),
+        ]
+    kept = "volume values along the rays" if stats.kept_bytes else "resampled in every step"
+    tiles.append(("kept samples", memory(stats.kept_bytes), kept))
     if result.exposure != 1.0:
         tiles.append(("exposure", f"{result.exposure:.4g}", "fitted factor from rendered to target radiance"))
     cell = lambda name, value, note: (
@@ -83,6 +82,9 @@ def _all_decibels(targets: Sequence[Any], fitted: Sequence[Any]) -> str:
 
 def identifiability(result: "FitResult", transfer: AbstractTransfer) -> str:
     stats, count = result.stats, _unknown_count(result)
+    if np.isnan(stats.condition):
+        text = f"{count:,} unknowns are too many for a Gauss-Newton matrix: jvr.voxel_errors estimates errors of voxels."
+        return f"<h2>What the images tell least about</h2><p>{text}</p>"
     missing = count - stats.rank
     if missing > 0:
         are = "are" if missing > 1 else "is"

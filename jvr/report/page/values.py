@@ -99,7 +99,11 @@ def other_values(scene: Any, errors: Mapping[str, np.ndarray]) -> str:
             text = ", ".join(_cell(v, e) for v, e in zip(value.ravel().tolist(), error.ravel().tolist(), strict=True))
         else:
             unknown = int(np.sum(~np.isfinite(error)))
-            text = f"{value.size:,} values, of which the images do not determine {unknown:,}"
+            text = f"{value.size:,} values" + (
+                ", too many for standard errors here"
+                if np.isnan(error).all()
+                else f", of which the images do not determine {unknown:,}"
+            )
         rows.append(f"<tr><th>{escape(name)}</th><td>{text}</td></tr>")
     return f'<h2>Other fitted values</h2><div class="scroll"><table>{"".join(rows)}</table></div>' if rows else ""
 

@@ -149,12 +149,31 @@ class StartTable(Table):
         return self
 
 
+class TikhonovTable(Table):
+    """Strengths of `jvr.Tikhonov`, and the scalar that voxels are drawn to."""
+
+    gradient: Annotated[float, number("strength", NOT_NEGATIVE)] = 0.0
+    values: Annotated[float, number("strength", NOT_NEGATIVE)] = 0.0
+    reference: Scalar = 0.0
+
+
 class PriorsTable(Table):
     """Strengths of the priors; what is not named is not used."""
 
     colour_smoothness: Annotated[float, number("strength", NOT_NEGATIVE)] | None = None
     extinction_smoothness: Annotated[float, number("strength", NOT_NEGATIVE)] | None = None
     sparsity: Annotated[float, number("strength", NOT_NEGATIVE)] | None = None
+    total_variation: Annotated[float, number("strength", NOT_NEGATIVE)] | None = None
+    tikhonov: TikhonovTable | None = None
+
+
+class VoxelsTable(Table):
+    """A fit of the voxels: the scalar that all of them start with (that of the volume without it), the range that they keep to, and on how
+    many grids they are found, from coarse to fine."""
+
+    start: Scalar | None = None
+    range: Range | None = None
+    levels: Annotated[int, whole("grids", AT_LEAST_ONE)] = 1
 
 
 def _keep(value: Any) -> Any:
@@ -173,6 +192,7 @@ def _held_out(value: Any) -> Any:
 
 # Keys that say how target images are read.
 OF_IMAGES = ("encoding", "alpha", "layer", "weights")
+VOXELS = "volume.values"
 LEAST_SQUARES = ("levenberg-marquardt", "gauss-newton", "dogleg")
 
 
@@ -196,6 +216,7 @@ class FitTable(Table):
     loss: Literal["squared-error", "huber", "absolute-error", "dssim"] = "squared-error"
     huber_delta: Annotated[float, number("radiance", POSITIVE)] = 0.05
     priors: PriorsTable = PriorsTable()
+    voxels: VoxelsTable | None = None
     exposure: bool = False
     keep_samples: Annotated[bool | int, BeforeValidator(_keep)] = True
     smooth_undetermined: bool = True
@@ -206,6 +227,8 @@ class FitTable(Table):
     def _check(self) -> "FitTable":
         if self.loss == "dssim" and self.solver in LEAST_SQUARES:
             raise problem(f"'dssim' is not a sum over pixels, which solver = '{self.solver}' needs: use 'bfgs' or 'adam'", "loss")
+        if self.voxels is not None and VOXELS not in self.unknowns:
+            raise problem(f"is about unknown voxels: name '{VOXELS}' in fit.unknowns, or leave it out", "voxels")
         for key in OF_IMAGES if self.images is None else ():
             if getattr(self, key) is not None:
                 raise problem("is about target images in files: name them in fit.images, or leave it out", key)

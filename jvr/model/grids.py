@@ -1,0 +1,52 @@
+"""Grids over one domain: the voxels of a volume on a coarser or a finer grid."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jvr.model.volume import Volume
+
+Shape = tuple[int, int, int]
+
+
+def resampled(values: Float[Array, "x y z"], shape: Shape) -> Float[Array, "x2 y2 z2"]:
+    """Voxels on another grid over the same domain, by trilinear interpolation: the first and the last voxel of each axis stay where they
+    are, and a linear field is reproduced. Linear in `values` and differentiable in them.
+
+    Places and weights are found in double precision. An axis of one voxel is constant.
+    """
+    for axis, (old, new) in enumerate(zip(values.shape, shape, strict=True)):
+        if old == new:
+            continue
+        place = np.linspace(0.0, old - 1.0, new) if new > 1 else np.array([(old - 1) / 2])
+        low = np.clip(np.floor(place), 0, max(old - 2, 0)).astype(np.int32)
+        along = [1] * 3
+        along[axis] = new
+        weight = jnp.asarray((place - low).reshape(along), values.dtype)
+        lower, upper = (jnp.take(values, np.minimum(i, old - 1), axis=axis) for i in (low, low + 1))
+        values = (1 - weight) * lower + weight * upper
+    return values
+
+
+def on_grid(volume: Volume, shape: Shape) -> Volume:
+    """The volume on another grid over the same domain, its voxels in floating point (`resampled`).
+
+    **Raises** `ValueError` where voxels are missing: what lies around them on another grid is not known.
+    """
+    if volume.gaps is not None:
+        raise ValueError("voxels are missing, which have no place on another grid: fill them in, or fit on the volume's own grid")
+    matrix = np.asarray(volume.world_from_grid, np.float64) + np.asarray(
+        volume.remainder.beside(volume.world_from_grid), np.float64
+    )
+    longer = [(old - 1) / (new - 1) if old > 1 and new > 1 else 1.0 for old, new in zip(volume.shape, shape, strict=True)]
+    matrix[:3, :3] *= np.array(longer)
+    values = resampled(volume.values.astype(jnp.result_type(float)), shape)
+    return dataclasses.replace(volume, values=values, world_from_grid=matrix)
+
+
+def coarser(shape: Shape) -> Shape:
+    """The grid whose voxels lie twice as far apart, or a little less where the ends of an axis would not be among them."""
+    x, y, z = (n // 2 + 1 if n > 1 else 1 for n in shape)
+    return x, y, z
