@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jvr
-from experiments import contact_sheet, convergence, phase_recovery, relight, shadowed_fit
+from experiments import contact_sheet, convergence, other_renderers, phase_recovery, relight, shadowed_fit
 from jvr.io.config import build_fit, build_scene, read_config
 
 
@@ -156,3 +156,21 @@ def test_convergence_runs_beside_scipy(monkeypatch, tmp_path):
         assert len(found["jvr"]) == 2
         # The compression keeps the length of the residual: SciPy's error is that of its table.
         assert found["scipy"][0]["mse"] >= 0.99 * found["best"]
+
+
+@pytest.mark.slow
+def test_pictures_of_other_renderers_are_explained(monkeypatch, tmp_path):
+    """The quick phantom: jvr draws the known function as VTK does, and a fit explains a view that was kept aside as well."""
+    pytest.importorskip("vtk")
+    numbers = tmp_path / "numbers.json"
+    monkeypatch.setattr(sys, "argv", ["experiment", "--quick", "--json", str(numbers), "--only", "GPU"])
+    other_renderers.main()
+    found = json.loads(numbers.read_text())
+    assert set(found) == {"VTK GPU, phantom", "VTK GPU, phantom, shaded"}
+    plain, shaded = found.values()
+    # 20 voxels a side leave surfaces of a pixel: 40 dB, where scans in larger pictures come to more than 50.
+    assert plain["known_psnr"] > 39
+    assert plain["held_out_psnr"] > plain["known_psnr"] - 1.5
+    assert shaded["held_out_psnr"] > 35
+    assert plain["opacity_rmse"] < 0.06
+    assert all(row["outcome"] == "CONVERGED" for row in found.values())

@@ -31,7 +31,7 @@ from jvr.fitting.problem import Problem
 from jvr.fitting.reach import known_background, say_what_is_out_of_reach
 from jvr.fitting.result import FitResult, FitStats, Iteration
 from jvr.fitting.solvers import AbstractSolver
-from jvr.fitting.targets import Targets, targets_of
+from jvr.fitting.targets import Targets, check_cameras, targets_of
 from jvr.fitting.unknowns import ExposedModel, Unknowns, choose_unknowns, is_shared, selected, takes_cameras
 from jvr.fitting.views import Views
 from jvr.model.camera import AbstractCamera
@@ -115,6 +115,7 @@ def fit(
     began = time.perf_counter()
     solver = _as_solver(solver)
     check_settings(settings)
+    check_cameras(cameras)
     scene, views = scene.current(), () if isinstance(cameras, AbstractCamera) else tuple(cameras)
     model = _with_views(ExposedModel(scene, jnp.ones(()) if exposure else None), views, unknowns)
     choose = lambda model: _choose(model, views, unknowns, transforms, solver)
@@ -301,6 +302,10 @@ def _counted(chosen: Unknowns, model: ExposedModel, which: np.ndarray) -> tuple[
 
 def _held_out(held_out: tuple[Any, ...], behind: Any) -> tuple[Sequence[AbstractCamera], Targets, Lights | None]:
     """Cameras, targets and lights of views that take no part."""
+    if not isinstance(held_out, tuple | list) or len(held_out) not in (2, 3):
+        raise TypeError(
+            "held_out must be (cameras, images) or (cameras, images, lights), each a sequence with an entry for each view"
+        )
     cameras, images, *rest = held_out
     lights = lights_of(rest[0] if rest else None, cameras, "held-out view")
     return cameras, targets_of(cameras, images, None, behind, "held-out image"), lights

@@ -17,6 +17,7 @@ from jvr.fitting.normal_equations import light_tangents, normal_equations
 from jvr.fitting.observations import is_mostly_empty, observe
 from jvr.fitting.problem import Problem
 from jvr.fitting.result import FitResult
+from jvr.fitting.targets import check_cameras
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns, leaves_by_name
 from jvr.model.camera import AbstractCamera, fibonacci_sphere
 from jvr.model.exact import Remainder, in_double
@@ -133,9 +134,12 @@ def around(scene: Scene, cameras: Sequence[AbstractCamera], count: int = COUNT) 
 
 
 def ranked(
-    known: Knowledge, candidates: Sequence[AbstractCamera], settings: Settings, pixels: int = PIXELS
+    known: Knowledge, candidates: Sequence[AbstractCamera], settings: Settings, pixels: int = PIXELS, most: int | None = None
 ) -> tuple[Candidate, ...]:
-    """`next_view` of what a fit knows."""
+    """`next_view` of what a fit knows, the `most` first."""
+    if isinstance(candidates, AbstractCamera):
+        raise TypeError("candidates must be a sequence: put a single one in brackets, as [camera]")
+    check_cameras(candidates, "candidates")
     if not len(candidates):
         raise ValueError("there are no candidates: give cameras that could be taken, such as jvr.orbit(...)")
     if pixels < 1:
@@ -145,15 +149,15 @@ def ranked(
     named = lambda errors: _by_name(problem, known.unknowns, errors)
     # In units of what is plausible, so that the small matrix is well scaled.
     before = size[:, None] * known.information * size + np.eye(size.size)
-    errors = named(size * np.sqrt(np.diag(np.linalg.inv(before))))
     # As in the information of a fit whose residuals are all zero.
     variance = max(known.variance, TINY)
-    found = []
-    for i, camera in enumerate(candidates):
-        after = before + size[:, None] * _information(problem, values, i, camera, pixels) * size / variance
-        gain = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]) / np.log(2)
-        found.append(Candidate(i, camera, float(gain), named(size * np.sqrt(np.diag(np.linalg.inv(after)))), errors))
-    return tuple(sorted(found, key=lambda candidate: -candidate.gain))
+    added = [_information(problem, values, i, camera, pixels) / variance for i, camera in enumerate(candidates)]
+    after = [before + size[:, None] * matrix * size for matrix in added]
+    gains = np.array([np.linalg.slogdet(matrix)[1] for matrix in after]) - np.linalg.slogdet(before)[1]
+    errors = lambda matrix: named(size * np.sqrt(np.diag(np.linalg.inv(matrix))))
+    without = errors(before)
+    order = np.argsort(-gains, kind="stable")[:most].tolist()
+    return tuple(Candidate(i, candidates[i], float(gains[i]) / (2 * np.log(2)), errors(after[i]), without) for i in order)
 
 
 def scene_with(start: Scene, values: dict[str, np.ndarray]) -> Scene:
@@ -232,7 +236,7 @@ def best_of(result: FitResult) -> Candidate | None:
     if result.information is None or not result.cameras:
         return None
     try:
-        return next_view(result)[0]
+        return ranked(Knowledge.of(result), around(result.scene, result.cameras), result.settings, most=1)[0]
     except ValueError:
         return None
 

@@ -35,6 +35,17 @@ class Targets(NamedTuple):
         return [np.where(known[..., None], image, np.nan) for image, known in zip(self.images, self.counted, strict=True)]
 
 
+def check_cameras(cameras: Any, name: str = "cameras") -> None:
+    """**Raises** `TypeError` for what is no sequence of cameras; a single camera is told apart where its image is known."""
+    if isinstance(cameras, AbstractCamera):
+        return
+    if not isinstance(cameras, Sequence):
+        raise TypeError(f"{name} must be a list or tuple of jvr's cameras, such as jvr.orbit(...), not {type(cameras).__name__}")
+    wrong = next((camera for camera in cameras if not isinstance(camera, AbstractCamera)), None)
+    if wrong is not None:
+        raise TypeError(f"{name} must hold jvr's cameras, such as jvr.PerspectiveCamera.look_at(...), not {wrong!r:.60}")
+
+
 def check_images(cameras: Sequence[AbstractCamera], images: Any, name: str = "target image") -> list[np.ndarray]:
     """The images as float arrays, one for each camera and of its size.
 
@@ -104,6 +115,11 @@ def _arrays(cameras: Sequence[AbstractCamera], images: Any, name: str) -> list[n
     """The images with three or four channels, which hold no codes as far as that can be told."""
     if isinstance(cameras, AbstractCamera) or getattr(images, "ndim", 4) == 3:
         raise TypeError("cameras and images must be sequences of as many: put a single one in brackets, as [camera] and [image]")
+    check_cameras(cameras)
+    if not hasattr(images, "__iter__"):
+        raise TypeError(
+            f"{name}s must be a sequence of arrays (height, width, 3), one for each camera, not {type(images).__name__}"
+        )
     arrays = [as_radiance(image, f"{name} {i}").astype(jnp.result_type(float)) for i, image in enumerate(images)]
     if len(arrays) != len(cameras) or not arrays:
         raise ValueError(

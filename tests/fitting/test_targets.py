@@ -1,5 +1,6 @@
 """Target images that others made: which pixels count, what is behind them, and what no scene can show."""
 
+import re
 import warnings
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 import jvr
 from jvr.fitting.problem import Problem
 from jvr.fitting.reach import known_background, say_what_is_out_of_reach
-from jvr.fitting.targets import targets_of
+from jvr.fitting.targets import check_cameras, targets_of
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns, selected
 from jvr.rendering.measure import psnr, similarity
 
@@ -268,3 +269,16 @@ def test_held_out_images_are_refused_before_the_fit():
     with pytest.raises(ValueError, match="held-out image 0 has shape"):
         fit(held_out=(CAMERAS[:1], [IMAGES[0][:3]]), max_steps=3, progress=steps.append)
     assert steps == []
+
+
+@pytest.mark.parametrize(
+    ("cameras", "wanted"),
+    [
+        (None, "not NoneType"),
+        ((camera for camera in ()), "must be a list or tuple of jvr's cameras, such as jvr.orbit(...), not generator"),
+        (["front.png"], "must hold jvr's cameras, such as jvr.PerspectiveCamera.look_at(...), not 'front.png'"),
+    ],
+)
+def test_what_is_no_sequence_of_cameras_is_refused(cameras, wanted):
+    with pytest.raises(TypeError, match=re.escape(wanted)):
+        check_cameras(cameras)

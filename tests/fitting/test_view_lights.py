@@ -28,24 +28,25 @@ CAMERAS = jvr.fibonacci_sphere(SCENE.volume.center, 22.0, 3, 34.0, 9, 8)
 
 
 def shading(scene: jvr.Scene):
-    return scene.transfer.rgb, scene.shading.diffuse, scene.shading.specular
+    # The diffuse coefficient and colours show as their product.
+    return scene.transfer.rgb, scene.shading.specular, scene.shading.shininess
 
 
 def under(scene: jvr.Scene, light: jvr.DirectionalLight) -> jvr.Scene:
     return dataclasses.replace(scene, lights=(light,))
 
 
-def pictures(lights, noise: float = NOISE) -> list[np.ndarray]:
+def pictures(lights, noise: float = NOISE, cameras=CAMERAS) -> list[np.ndarray]:
     rng = np.random.default_rng(3)
     render = jax.jit(lambda light, camera: jvr.render(under(SCENE, light), camera, SETTINGS).rgb)
-    made = [np.asarray(render(light, camera)) for light, camera in zip(lights, CAMERAS, strict=True)]
+    made = [np.asarray(render(light, camera)) for light, camera in zip(lights, cameras, strict=True)]
     return [(image + noise * rng.standard_normal(image.shape)).astype(np.float32) for image in made]
 
 
-def fit(start=SCENE, images=None, lights=LIGHTS, **keywords) -> jvr.FitResult:
+def fit(start=SCENE, images=None, lights=LIGHTS, cameras=CAMERAS, **keywords) -> jvr.FitResult:
     images = pictures(LIGHTS) if images is None else images
     keywords = {"unknowns": shading, "settings": SETTINGS, "progress": False, "max_steps": 0, **keywords}
-    return jvr.fit(start, CAMERAS, images, lights=lights, smooth_undetermined=False, **keywords)
+    return jvr.fit(start, cameras, images, lights=lights, smooth_undetermined=False, **keywords)
 
 
 def test_the_matrix_is_that_of_each_view_under_its_own_lights():
@@ -97,13 +98,16 @@ def test_a_step_counts_priors_once_and_views_that_are_kept_aside_have_their_ligh
 
 @pytest.mark.slow
 def test_surfaces_are_known_better_from_pictures_under_several_lights():
-    """Each error is smaller, and a fit from a wrong start comes to the truth within three of them."""
-    one = fit(images=pictures([LIGHTS[0]] * 3), lights=None)
-    several = fit()
-    for name, before in one.errors_by_name.items():
-        assert np.all(several.errors_by_name[name] < before), name
-    assert several.errors_by_name["shading.diffuse"] < 0.7 * one.errors_by_name["shading.diffuse"]
-    start = eqx.tree_at(shading, SCENE, (jnp.full((3, 3), 0.5), jnp.asarray(0.4), jnp.asarray(0.1)))
+    """Three pictures from one place: variances are smaller than the mean of those under each light alone, as the inverse is convex. A fit
+    from a wrong start comes to the truth within three and a half errors."""
+    there = CAMERAS[:1] * 3
+    alone = [fit(images=pictures([light] * 3, cameras=there), lights=[light] * 3, cameras=there) for light in LIGHTS]
+    several = fit(images=pictures(LIGHTS, cameras=there), cameras=there)
+    for name, after in several.errors_by_name.items():
+        before = np.sqrt(np.mean([np.square(one.errors_by_name[name]) for one in alone], axis=0))
+        assert np.all(np.isfinite(after))
+        assert np.all(after < 0.9 * before), name
+    start = eqx.tree_at(shading, SCENE, (jnp.full((3, 3), 0.5), jnp.asarray(0.1), jnp.asarray(4.0)))
     found = fit(start, max_steps=40)
     for value, true, error in zip(shading(found.scene), shading(SCENE), found.standard_errors, strict=True):
         assert np.all(np.abs(value - true) < 3.5 * np.asarray(error))
