@@ -19,6 +19,7 @@ import numpy as np
 import jvr
 from benchmarks import scenes, yardsticks
 from benchmarks.light import light
+from benchmarks.poses import pose_step
 from benchmarks.preparation import preparation
 from benchmarks.timing import median, ratio, seconds
 from jvr.march.march import MarchOptions, march
@@ -175,7 +176,8 @@ def _measured(function: str, *arguments: str | int) -> str:
 
 
 def fitting() -> dict[str, Any]:
-    """The CT head protocol (docs/fitting.md): time to 60 dB in evaluations of a plain forward march over the same kept samples."""
+    """The CT head protocol (docs/fitting.md): time to 60 dB in evaluations of a plain forward march over the same kept samples, and a step
+    of all poses of its views in pictures of these."""
     from experiments.protocols import ct_head
     from jvr.fitting.observations import inside, keep_samples, observe, observed_medium, prepare_in_fit
 
@@ -218,6 +220,7 @@ def fitting() -> dict[str, Any]:
         "evaluations_to_60_db": statistics.median(a / b for a, b in zip(to_60, evaluations, strict=True)),
         "kept_bytes": result.stats.kept_bytes,
         "negligible": less,
+        "poses": pose_step(protocol.truth, cameras, images, settings, repeats=5),
     }
 
 

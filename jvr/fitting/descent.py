@@ -1,5 +1,6 @@
 """The iteration of a fit: steps of a solver with their history, which is shown and saved on the way."""
 
+import dataclasses
 import sys
 import time
 from collections.abc import Callable
@@ -11,10 +12,14 @@ from jaxtyping import Array, Float
 
 from jvr.fitting import checkpoint
 from jvr.fitting.evaluator import Evaluator
+from jvr.fitting.least_squares import ChunkedLeastSquares
 from jvr.fitting.problem import Problem
 from jvr.fitting.result import Iteration
 from jvr.fitting.solvers import AbstractSolver
 from jvr.types import Outcome
+
+# Relative decrease at which a stage on the way ends.
+ROUGH = 0.02
 
 
 class Checkpoint(NamedTuple):
@@ -61,22 +66,24 @@ class Descent:
         share: float = 1.0,
     ) -> Float[Array, "unknowns"]:
         """The values at the end of an iteration from `start`, by default the values of the problem's own model. `share`: of all rays that
-        the problem has."""
-        unknowns, functions = problem.unknowns, evaluator.functions
-        state = self.solver.init(functions, unknowns.unconstrained_from_model(problem.model) if start is None else start)
+        the problem has; a problem that does not have all is a stage on the way, which need not be found to the last digit."""
+        unknowns, functions, solver = problem.unknowns, evaluator.functions, self.solver
+        if share < 1 and isinstance(solver, ChunkedLeastSquares):
+            solver = dataclasses.replace(solver, rtol=max(solver.rtol, ROUGH))
+        state = solver.init(functions, unknowns.unconstrained_from_model(problem.model) if start is None else start)
         if file is not None and file.is_there:
             state, rows = checkpoint.load(file.path, state, file.mark)
             self.history = [Iteration(**row) for row in rows]
             self.began -= self.history[-1].seconds if self.history else 0.0
-        self.outcome = self.solver.outcome(state)
+        self.outcome = solver.outcome(state)
         while self.outcome is None and len(self.history) < self.max_steps:
-            state = self.solver.step(functions, state)
+            state = solver.step(functions, state)
             self.history.append(self._iteration(evaluator, state, share))
             if file is not None:
                 checkpoint.save(file.path, state, [entry._asdict() for entry in self.history], file.mark)
             self._show(self.history[-1])
-            self.outcome = self.solver.outcome(state)
-        unconstrained, _ = self.solver.iterate(state)
+            self.outcome = solver.outcome(state)
+        unconstrained, _ = solver.iterate(state)
         return unknowns.values_from_unconstrained(jnp.asarray(unconstrained), problem.model)
 
     def _iteration(self, evaluator: Evaluator, state: Any, share: float) -> Iteration:

@@ -260,6 +260,33 @@ def test_the_next_view_adds_to_what_unknown_poses_leave():
         jvr.next_view(fit(CAMERAS[:1], IMAGES[:1], max_steps=0), [CAMERAS[1]], SETTINGS)
 
 
+@pytest.mark.slow
+def test_standard_errors_of_poses_cover_the_truth():
+    """Of 60 fits with fresh noise 68 % of the true motions lie within one standard error: in the world's axes, about the centre. Three
+    cameras at a time are as many experiments; the binomial spread of 60 x 18 numbers that are not all independent is about 3 %."""
+    within = []
+    for seed in range(60):
+        result = fit(images=noisy(seed))
+        for camera, truth, errors in zip(result.cameras, CAMERAS, result.standard_errors, strict=True):
+            step = pose_of(truth) @ np.linalg.inv(pose_of(camera))
+            turn = np.degrees([step[2, 1] - step[1, 2], step[0, 2] - step[2, 0], step[1, 0] - step[0, 1]]) / 2
+            shift = step[:3, :3] @ CENTER + step[:3, 3] - CENTER
+            within.append(np.abs(np.concatenate([turn, shift])) < np.asarray(errors))
+    assert 0.62 < np.mean(within) < 0.74
+    assert np.all(np.abs(np.mean(within, axis=0) - 0.68) < 0.12)
+
+
+@pytest.mark.slow
+def test_another_shader_has_the_rows_of_another_way():
+    """Lit scenes are replayed whole; with a light that shows nothing they are those of the plain medium's own way."""
+    lit = dataclasses.replace(TRUTH, shading=jvr.Lambert(ambient=1.0, diffuse=0.0), lights=(jvr.AmbientLight(1.0),))
+    plain, shaded = (fit(images=noisy(2), scene=scene, max_steps=0) for scene in (TRUTH, lit))
+    scale = np.sqrt(np.diag(plain.information))
+    ratio = shaded.stats.residual_variance / plain.stats.residual_variance
+    np.testing.assert_allclose(ratio, 1, rtol=1e-4)
+    np.testing.assert_allclose((shaded.information - plain.information) / scale / scale[:, None], 0, atol=1e-3)
+
+
 # --- The coarse start ------------------------------------------------------------------------------------------------
 
 
