@@ -82,7 +82,7 @@ def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tup
     else:
         primal, rows = _table_jacobian((options, entries.sigma_t is not None), medium, rays, dt)
         tangents = (tangents[0]._replace(transfer=rest_of_transfer), *tangents[1:])
-        tangent = _times_entries(rows, entries)
+        tangent = _times_entries(primal, rows, entries)
     if jax.tree.leaves(tangents):
         rest = _times_rays(options, primals, tangents)
         tangent = rest if tangent is None else jax.tree.map(jnp.add, tangent, rest)
@@ -107,20 +107,18 @@ def _split_entries(tree: AbstractTransfer) -> tuple[Any, Any]:
     return rest, entries
 
 
-def _times_entries(rows: TableJacobian, tangent: Any) -> Marched:
-    """Rows of a table times a direction in its entries."""
+def _times_entries(primal: Marched, rows: TableJacobian, tangent: Any) -> Marched:
+    """Rows of a table times a direction in its entries; optical depths depend on extinctions alone, and have no rows without them."""
     rgb, sigma_t = tangent.rgb, tangent.sigma_t
     sigma_column = lambda c: sigma_t if sigma_t.ndim == 1 else sigma_t[:, c]
-    radiance = [jnp.zeros(r.shape[0], r.dtype) for r in rows.radiance_rgb]
-    tau = [jnp.zeros(r.shape[0], r.dtype) for r in rows.tau_sigma]
+    radiance, tau = [[jnp.zeros_like(x) for x in channels] for channels in (primal.radiance, primal.tau)]
     for c in range(len(radiance)):
         if rgb is not None:
             radiance[c] += rows.radiance_rgb[c] @ rgb[:, c]
         if sigma_t is not None:
             radiance[c] += rows.radiance_sigma[c] @ sigma_column(c)
-    for c in range(len(tau)):
-        if sigma_t is not None:
-            tau[c] += rows.tau_sigma[c] @ sigma_column(c)
+    for c, of_entries in enumerate(rows.tau_sigma):
+        tau[c] += of_entries @ sigma_column(c)
     return Marched(tuple(radiance), tuple(tau), (), None)
 
 

@@ -183,6 +183,7 @@ def test_gradients_go_through_cameras():
 # --- Fits ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_poses_come_back():
     start = disturbed(4.0, 1.0)
     result = fit(start)
