@@ -391,26 +391,38 @@ def all_finite(tree: Any) -> bool:
     return all(bool(np.isfinite(np.asarray(x)).all()) for x in jax.tree.leaves(tree))
 
 
+class Placed(NamedTuple):
+    """A case in its row of the table; `modes`: whether forward mode and `vmap` are looked at too."""
+
+    row: str
+    case: Case
+    modes: bool
+
+
+def groups(quick: bool = False) -> list[list[Placed]]:
+    """All cases, those of one structure together, which share their programs."""
+    found: dict[str, list[Placed]] = {}
+    for number, (row, cases) in enumerate(rows(quick).items()):
+        for k, case in enumerate(cases):
+            structure = str(jax.tree.map(lambda x: (np.shape(x), np.asarray(x).dtype), (case.scene, case.camera)))
+            # Forward mode and vmap take longest to compile and say the least.
+            placed = Placed(row, case, not quick or (k == 0 and number % 4 == 0))
+            found.setdefault(structure, []).append(placed)
+    return list(found.values())
+
+
 def table(quick: bool = False, report: Callable[[str, Case, Found], None] | None = None):
     """For each row the worst error of value and of gradient, and what is not finite."""
-    ways, found, latest = compiled_ways(), {}, None
-    of_rows = rows(quick)
-    first = {id(cases[0]) for number, cases in enumerate(of_rows.values()) if number % 4 == 0}
-    # Cases of one structure come together: programs of others are of no more use, and hundreds of them exhaust a process's memory mappings.
-    for name, case in sorted(((n, c) for n, cases in of_rows.items() for c in cases), key=lambda pair: _structure(pair[1])):
-        if _structure(case) != latest:
-            jax.clear_caches()
-            latest = _structure(case)
-        # Forward mode and vmap take longest to compile and say the least.
-        found[id(case)] = measured(case, ways, modes=not quick or id(case) in first)
-        if report:
-            report(name, case, found[id(case)])
-    return [_row(name, [found[id(case)] for case in cases]) for name, cases in of_rows.items()]
-
-
-def _structure(case: Case) -> str:
-    """What tells the programs of two cases apart."""
-    return str(jax.tree.map(lambda x: (np.shape(x), np.asarray(x).dtype), (case.scene, case.camera)))
+    found: dict[str, list[Found]] = {row: [] for row in rows(quick)}
+    for group in groups(quick):
+        # Programs of other structures are of no more use, and hundreds of them exhaust a process's memory mappings.
+        jax.clear_caches()
+        ways = compiled_ways()
+        for row, case, modes in group:
+            found[row].append(measured(case, ways, modes=modes))
+            if report:
+                report(row, case, found[row][-1])
+    return [_row(row, of_row) for row, of_row in found.items()]
 
 
 def _row(name: str, found: list[Found]) -> dict[str, Any]:

@@ -105,7 +105,9 @@ def pages_with(found: list[pages.Block], *slow: str) -> list:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     "page",
-    pages_with(pages.blocks("python"), "docs/environment_lighting.md", "docs/fitting.md", "docs/light.md", "docs/voxels.md"),
+    pages_with(
+        pages.blocks("python"), "README.md", "docs/environment_lighting.md", "docs/fitting.md", "docs/light.md", "docs/voxels.md"
+    ),
 )
 def test_code_runs(page, desk):
     smaller = dict(WHOLE.get(page, {}))

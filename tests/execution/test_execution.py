@@ -89,7 +89,12 @@ def test_what_does_not_fit_at_all_and_other_failures_are_raised(message, warns, 
 
 
 @pytest.mark.parametrize(
-    ("adjoint", "lit"), [(jvr.Replay(), False), pytest.param(jvr.Replay(), True, marks=pytest.mark.slow), (jvr.Rows(), False)]
+    ("adjoint", "lit"),
+    [
+        (jvr.Replay(), False),
+        pytest.param(jvr.Replay(), True, marks=pytest.mark.slow),
+        pytest.param(jvr.Rows(), False, marks=pytest.mark.slow),
+    ],
 )
 def test_a_derivative_outside_of_jit_is_that_of_one_program(x64, adjoint, lit):
     """In everything that is an array of a picture that tiles do not divide, and compiled once."""
@@ -190,6 +195,7 @@ def test_a_device_waits_for_another_one(patience, seconds):
         assert float(ran.stdout) > 45, "no longer than the compiler's own choice"
 
 
+@pytest.mark.slow
 def test_functions_of_scenes_are_exported_to_another_process(tmp_path):
     jvr.use_export()
     scene, camera = small(), perspective(small().volume, 7, 5)

@@ -35,6 +35,7 @@ def _dense(scene: jvr.Scene, images: list[np.ndarray]) -> tuple[np.ndarray, np.n
         return r, r + np.stack(images), np.concatenate([np.reshape(part, (*r.shape, -1)) for part in parts], axis=-1)
 
 
+@pytest.mark.slow
 def test_standard_errors_of_structured_residuals_are_those_of_a_dense_sandwich():
     """A brightness that jumps from square to square is no noise. Against sums over slices of pictures in NumPy."""
     rng = np.random.default_rng(3)

@@ -95,6 +95,7 @@ def test_an_even_picture_takes_the_first_two_grids():
     assert np.sum(picture.stats.sampling.traced) == 12 * 10
 
 
+@pytest.mark.slow
 def test_refined_pictures_have_derivatives(x64):
     s = scene(transfer=SMOOTH([0.0, 0.15]))
     camera, settings = view(s, 13, 11), sampled(jvr.Refinement(0.01, tile=4))

@@ -77,6 +77,7 @@ def test_there_is_no_shell_around_what_is_missing(normals):
     np.testing.assert_allclose(draw(hidden), draw(ramp), atol=0.02)
 
 
+@pytest.mark.slow
 def test_light_passes_what_is_missing():
     """Single scattering of light from the eye's side: a sample at optical depth `t` shows `exp(-2 t)`, so `(1 - exp(-2 depth)) / 2` in
     all, of which a hole takes nothing but its own depth."""
