@@ -16,12 +16,15 @@ from jvr.fitting.solvers import AbstractSolver, Functions
 from jvr.model.ranges import Interval
 from jvr.types import Outcome
 
+# A first step may be so many times too long: a line search halves it four times, and shorter ones leave few unknowns where they are.
+FIRST_STEP = 16
+
 
 class Scaled(eqx.Module):
     """An objective times a factor. Quasi-Newton methods leave out updates whose curvature is under the rounding of float32, which a
     mean over pixels starts out with; scaled by `unknowns / objective` at the start, a step of one changes it by about itself. Where most
-    unknowns are hardly seen, as voxels are, a first step along its gradient would still promise less than nothing: it is scaled by
-    `objective / |gradient|^2` at most, by which that step ends at zero (Polyak 1969)."""
+    unknowns are hardly seen, as voxels are, a first step along its gradient would still promise far less than nothing: it is scaled by
+    `FIRST_STEP * objective / |gradient|^2` at most; by the quotient alone that step ends at zero (Polyak 1969)."""
 
     function: Any
     factor: Array
@@ -37,7 +40,7 @@ def _start(function: Any, unconstrained: Array) -> tuple[Array, Array]:
     loss, gradient = jax.value_and_grad(lambda x: function(x, None)[0])(unconstrained)
     squared = jnp.sum(jnp.square(gradient))
     known = (loss > 0) & (squared > 0)
-    factor = jnp.minimum(unconstrained.size / jnp.where(known, loss, 1.0), loss / jnp.where(known, squared, 1.0))
+    factor = jnp.minimum(unconstrained.size / jnp.where(known, loss, 1.0), FIRST_STEP * loss / jnp.where(known, squared, 1.0))
     return loss, jnp.where(known & jnp.isfinite(factor) & (factor > 0), factor, 1.0)
 
 
