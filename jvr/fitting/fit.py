@@ -92,8 +92,8 @@ def fit(
     - `smooth_undetermined`: continue entries of a table that the images do not determine smoothly from those that they do, in place of what
       the iteration left there (`jvr.fitting.continuation`); it adds at most 0.01 dB of error.
     - `coarse_levels`: so many times the fit begins with pictures averaged over squares of 3 pixels a side, 9, 27 and so on, coarsest
-      first, and voxels averaged to about the size of such a pixel (`jvr.fitting.coarse`): from there poses are found that are many
-      pixels away, as a rule of two levels some 10 degrees. Levels whose pictures would have fewer than 8 pixels a side are left out.
+      first, and voxels averaged to about the size of such a pixel (`jvr.fitting.coarse`), for poses that are many pixels away
+      (`experiments/pose_recovery.py` says how far it helps). Levels whose pictures would have fewer than 8 pixels a side are left out.
     - `max_steps`: iterations at most, those of all levels together.
     - `checkpoint`: a file written after every iteration on whole pictures, from which `resume=True` goes on.
     - `progress`: `None` shows a bar on stderr where that is a terminal; a function is called with each `Iteration`.
@@ -109,12 +109,15 @@ def fit(
 
     **Raises** `ValueError` for images that do not fit the cameras, unknowns that are not arrays of the scene or the cameras, too many
     unknowns for a least-squares solver, a loss that the solver cannot use, cameras that all miss the volume, an unknown camera that sees
-    nothing of it, or an integrator whose radiance has no derivative. A non-finite value ends the fit with that outcome and the last
+    nothing of it, a negative number of steps, or an integrator whose radiance has no derivative.
+    A non-finite value ends the fit with that outcome and the last
     good iterate.
     """
     began = time.perf_counter()
     solver = _as_solver(solver)
     check_settings(settings)
+    if max_steps < 0:
+        raise ValueError(f"max_steps must be at least 0, not {max_steps}")
     check_cameras(cameras)
     scene, views = scene.current(), () if isinstance(cameras, AbstractCamera) else tuple(cameras)
     model = _with_views(ExposedModel(scene, jnp.ones(()) if exposure else None), views, unknowns)

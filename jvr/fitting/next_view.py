@@ -239,11 +239,3 @@ def best_of(result: FitResult) -> Candidate | None:
         return ranked(Knowledge.of(result), around(result.scene, result.cameras), result.settings, most=1)[0]
     except ValueError:
         return None
-
-
-def in_words(best: Candidate) -> str:
-    """What a candidate would bring, in a line."""
-    x, y, z = np.asarray(best.camera.world_from_camera)[:3, 3]
-    medians = (f"{name} {np.median(before):.2g} to {np.median(best.errors[name]):.2g}" for name, before in best.before.items())
-    place = f"({x:.4g}, {y:.4g}, {z:.4g})"
-    return f"one more view, from {place}, would bring {best.gain:.1f} bits: median standard error of {', of '.join(medians)}"

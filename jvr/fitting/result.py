@@ -110,16 +110,7 @@ class FitResult(NamedTuple):
             lines.append(f"{name}: {middle}{errors.size - known.size} of {errors.size} not determined by the images")
         lines += [f"{name}: {count} values continued from their neighbours" for name, count in self.stats.smoothed]
         lines += ["neighbouring residuals are alike: the model does not explain the images"] if self.stats.is_misfit else []
-        lines += _one_more_view(self)
         return f"<div>{'<br>'.join(map(escape, lines))}{self.scene.transfer._repr_html_()}</div>"
-
-
-def _one_more_view(result: FitResult) -> list[str]:
-    """What the best of default candidates would bring, of a fit with few unknowns."""
-    from jvr.fitting.next_view import best_of, in_words
-
-    best = best_of(result)
-    return [] if best is None else [in_words(best)]
 
 
 def _poses_in_words(errors: dict[str, np.ndarray]) -> list[str]:

@@ -58,7 +58,7 @@ def voxel_errors(
     result: FitResult,
     cameras: Sequence[AbstractCamera],
     images: Any,
-    settings: Settings = Settings(),
+    settings: Settings | None = None,
     *,
     weights: Sequence[Any] | None = None,
     priors: Sequence[AbstractPrior] = (),
@@ -80,12 +80,13 @@ def voxel_errors(
 
     Other unknowns of the fit count as known, residuals as independent; bounds, robust losses and lights of single views play no part.
 
-    **Arguments:** `result`: of a fit of the voxels; `cameras`, `images`, `settings`, `weights`, `priors`: those of the fit; `noise`: the
+    **Arguments:** `result`: of a fit of the voxels; `cameras`, `images`, `weights`, `priors`: those of the fit; `settings`: by default its own;
+    `noise`: the
     standard deviation of a pixel of weight 1, by default from the residuals, `s^2 = sum w r^2 / (residuals - freedom)`;
     `voxels`: indices, by default all; `probes`: how many vectors `z`.
     **Raises** `ValueError` where the voxels were not fitted, indices lie outside, and what `jvr.fit` raises.
     """
-    problem, shape = _problem(result, settings, tuple(priors)), result.scene.volume.shape
+    problem, shape = _problem(result, settings or result.settings, tuple(priors)), result.scene.volume.shape
     places = np.arange(np.prod(shape)) if voxels is None else _places(voxels, shape)
     system, rng = _System(problem, cameras, images, weights, noise), np.random.default_rng(0)
     count = max(probes, 2) if voxels is None else FEW if noise is None else 0

@@ -12,7 +12,7 @@ from jvr.atomic import replacing
 from jvr.io.config import Config, config_from
 
 if TYPE_CHECKING:
-    from jvr.fitting.fit import FitResult
+    from jvr.fitting.result import FitResult
 
 VERSION = 1
 
@@ -73,6 +73,7 @@ def read_knowledge(path: Path) -> Saved:
             arrays = {name: file[name] for name in file.files if name != "meta"}
     except OSError:
         raise
+    # Whatever NumPy, zipfile and JSON say of damaged bytes.
     except Exception as error:
         raise KnowledgeError(f"{path}: damaged, or not written by a fit: run the fit again") from error
     if meta.get("version") != VERSION:

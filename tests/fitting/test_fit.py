@@ -377,6 +377,7 @@ def test_progress_is_called_with_every_iteration():
         ({"unknowns": lambda s: (s.transfer.rgb, s.transfer.rgb)}, "twice"),
         ({"transforms": (None,)}, "1 transforms for 2"),
         ({"weights": [np.ones((2, 2))] * 3}, "weights 0"),
+        ({"max_steps": -1}, "max_steps must be at least 0"),
     ],
 )
 def test_bad_input_is_named(change, message):

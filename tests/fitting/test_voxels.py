@@ -316,7 +316,7 @@ def test_errors_of_voxels_are_those_of_the_whole_matrix(prior):
         wanted = np.where((wanted <= 0.25) & (seen | (prior is not None)), wanted, np.inf)
         assert np.isfinite(wanted).sum() > 3
         places = list(np.ndindex(*scene.volume.shape))
-        exact = jvr.voxel_errors(result, cameras, images, SETTINGS, voxels=places[::3], **given)
+        exact = jvr.voxel_errors(result, cameras, images, voxels=places[::3], **given)
         np.testing.assert_allclose(exact.errors, wanted[::3], rtol=1e-3)
         assert exact.converged
         few, many = (jvr.voxel_errors(result, cameras, images, SETTINGS, probes=n, **given) for n in (16, 256))

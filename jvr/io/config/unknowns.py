@@ -38,7 +38,7 @@ def unknowns_of(config: Config, fit: FitTable, scene: Scene, cameras: tuple[Abst
 def _picked(name: str, scene: Scene, cameras: tuple[Any, ...]) -> Any:
     match = OF_CAMERAS.fullmatch(name)
     if match is None:
-        return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(scene)}[name]
+        return _arrays(scene)[name]
     index, field, common = match.groups()
     if common is not None:
         from jvr.fitting.unknowns import shared
@@ -64,7 +64,7 @@ def _check_of_cameras(config: Config, i: int, name: str, cameras: tuple[Abstract
 
 
 def _check_of_scene(config: Config, i: int, name: str, scene: Scene) -> None:
-    arrays = {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(scene)}
+    arrays = _arrays(scene)
     fittable = [name for name, leaf in arrays.items() if jnp.issubdtype(leaf.dtype, jnp.floating)]
     if name in fittable:
         return
@@ -77,3 +77,8 @@ def _check_of_scene(config: Config, i: int, name: str, scene: Scene) -> None:
             "volume.scale = [low, high] makes voxels floating-point numbers",
         )
     raise ConfigError(config.where(key), key, f"'{name}' {problem}; {hint}")
+
+
+def _arrays(scene: Scene) -> dict[str, jax.Array]:
+    """As `jvr.fitting.unknowns.leaves_by_name`, without importing what fits: a configuration is checked before that."""
+    return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(scene)}

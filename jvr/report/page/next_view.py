@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from jvr.fitting.fit import FitResult
+    from jvr.fitting.result import FitResult
 
 
 def one_more_view(result: "FitResult") -> str:
