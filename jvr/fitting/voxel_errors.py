@@ -80,8 +80,8 @@ def voxel_errors(
 
     Other unknowns of the fit count as known, residuals as independent; bounds, robust losses and lights of single views play no part.
 
-    **Arguments:** `result`: of a fit of the voxels; `cameras`, `images`, `weights`, `priors`: those of the fit; `settings`: by default its own;
-    `noise`: the
+    **Arguments:** `result`: of a fit of the voxels; `cameras`, `images`, `weights`, `priors`: those of the fit;
+    `settings`: by default its own; `noise`: the
     standard deviation of a pixel of weight 1, by default from the residuals, `s^2 = sum w r^2 / (residuals - freedom)`;
     `voxels`: indices, by default all; `probes`: how many vectors `z`.
     **Raises** `ValueError` where the voxels were not fitted, indices lie outside, and what `jvr.fit` raises.
