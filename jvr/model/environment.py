@@ -140,14 +140,19 @@ def map_pixels(image: str | os.PathLike | ArrayLike) -> Float[Array, "height wid
         from jvr.io.environment import read_environment
 
         image = read_environment(image)
-    if known(image) is not None:
-        as_radiance(image, "an environment map")
+    check_map(image)
     pixels = float_array(image, "an environment map", (None, None, 3))
-    height, width, _ = pixels.shape
-    if width != 2 * height:
-        raise ValueError(f"an environment map is twice as wide as high, not {width} x {height}: crop or resample it to 2:1")
     require(pixels, NOT_NEGATIVE.holds, "an environment map must be finite and not negative: mend its pixels")
     return pixels
+
+
+def check_map(image: ArrayLike) -> None:
+    """**Raises** `ValueError` for codes in place of radiance, and for maps that are not 2:1."""
+    if known(image) is not None:
+        as_radiance(image, "an environment map")
+    height, width, _ = float_array(image, "an environment map", (None, None, 3)).shape
+    if width != 2 * height:
+        raise ValueError(f"an environment map is twice as wide as high, not {width} x {height}: crop or resample it to 2:1")
 
 
 def _windowed(coefficients: Float[Array, "bands 3"], window: float | int | None) -> Float[Array, "bands 3"]:

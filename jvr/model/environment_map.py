@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jvr.model import harmonics
 from jvr.model.checks import colours, float_array
-from jvr.model.environment import EnvironmentLight, map_pixels, order_of_harmonics
+from jvr.model.environment import EnvironmentLight, check_map, map_pixels, order_of_harmonics
 from jvr.model.harmonics.projection import map_directions
 from jvr.model.parameters import TRIPLE, arguments, assign, choice, parameter
 from jvr.model.parts import AbstractPart, PlanEntry, is_zero
@@ -45,7 +45,8 @@ class EnvironmentMap(AbstractPart):
     order: int = order_of_harmonics()
 
     def __init__(self, pixels: ArrayLike, *, order: int = 3):
-        assign(self, pixels=map_pixels(pixels), order=order)
+        check_map(pixels)
+        assign(self, pixels=pixels, order=order)
 
     @classmethod
     @arguments(order=order_of_harmonics())
