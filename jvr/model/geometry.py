@@ -77,10 +77,9 @@ class DepthImage(AbstractGeometry):
     def from_image(cls, path: str | os.PathLike) -> "DepthImage":
         """The geometry of an OpenEXR file with channels R, G, B and Z, as `jvr render` writes them. **Raises** `ImageError` (a
         `ValueError`) for files that have none, and what reading a file raises."""
-        from jvr.io.exr import read_depth
-        from jvr.io.images import read_image
+        from jvr.io.geometry import read_depth_image
 
-        return cls(read_depth(path), read_image(path, alpha="ignored"))
+        return cls(*read_depth_image(path))
 
     @property
     def shape(self) -> tuple[int, int]:
