@@ -8,12 +8,13 @@ import jax.numpy as jnp
 
 import jvr
 from benchmarks.timing import median, ratio, seconds
-from experiments.tomography import VARIATION, VOXELS, beams
 
 
 def voxel_step(size: int = 64, views: int = 8, repeats: int = 5) -> dict[str, float]:
     """Seconds of the objective and its gradient in all voxels, with and without the prior, over those of plain pictures of the views, in
     turns."""
+    from experiments.tomography import VARIATION, VOXELS, beams
+
     of, settings = beams(size, views), jvr.Settings(1.0, termination=0.0)
     cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *of.cameras)
     targets, values, prior = (
