@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jvr.fitting import coarse
 from jvr.fitting.bijectors import Bounded
 from jvr.fitting.checkpoint import fingerprint
-from jvr.fitting.continuation import continued
+from jvr.fitting.continuation import are_determined, continued
 from jvr.fitting.descent import Checkpoint, Descent
 from jvr.fitting.evaluator import Evaluator
 from jvr.fitting.groups import Group, Lights, groups_of, lights_of, lit
@@ -159,14 +159,17 @@ def fit(
     evaluator.settle(problem)
     # The problem of the first group has its lights.
     model = problem.model if lights is None else model
-    known, quiet = undetermined(values.size), np.zeros(values.size, bool)
+    known, quiet, determined = undetermined(values.size), np.zeros(values.size, bool), np.zeros(0, bool)
     if march_unknowns(problem) <= MOST_FORWARD:
         known, around = evaluator.solution(values)
+        determined = are_determined(problem, np.asarray(values, np.float64), known.standard_errors)
         if smooth_undetermined:
             moved, quiet = continued(problem, np.asarray(values, np.float64), known.standard_errors, around, evaluator.objective)
             values = jnp.asarray(moved, values.dtype)
     found = chosen.insert(model, chosen.split(values, model))
     errors = chosen.split(jnp.asarray(known.standard_errors), model)
+    marks = np.split(determined, np.cumsum([error.size for error in errors])[:-1])
+    marks = [mark.reshape(error.shape) for mark, error in zip(marks, errors, strict=True)] if determined.size else []
     picked, structure = jax.tree.flatten(selected(unknowns, scene, views), is_leaf=is_shared)
     stats = FitStats(
         seconds=time.perf_counter() - began,
@@ -191,6 +194,7 @@ def fit(
         stats=stats,
         cameras=views if found.views is None else found.views.cameras,
         settings=settings,
+        determined=jax.tree.unflatten(structure, marks[: len(picked)]) if determined.size else None,
     )
 
 

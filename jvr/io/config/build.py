@@ -258,7 +258,7 @@ def _all_keywords(config: Config, fit: FitTable, scene: Scene, cameras: tuple[Ab
         "unknowns": unknowns_of(config, fit, scene, cameras),
         "settings": build_settings(config),
     }
-    return keywords | {"transforms": transforms_of(fit, scene.volume)}
+    return keywords | {"transforms": transforms_of(fit, scene.volume, len(cameras))}
 
 
 def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:
