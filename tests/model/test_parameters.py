@@ -212,6 +212,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "LambertBRDF": {},
     "LinearTransfer": {"positions": [0.0, 1.0], "rgb": RGB, "sigma_t": [0.1, 0.2]},
     "LutTransfer": {"rgb": RGB, "sigma_t": [0.1, 0.2], "domain": [0.0, 1.0]},
+    "Mesh": {"vertices": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], "faces": [[0, 1, 2]], "rgb": [0.1, 0.2, 0.3]},
     "MaterialByValue": {"positions": [0.0, 1.0], "materials": [jvr.LambertBRDF(), jvr.LambertBRDF()]},
     "MerlBRDF": {"table": np.full((2, 2, 2, 3), 0.1)},
     "MicrofacetBRDF": {},
