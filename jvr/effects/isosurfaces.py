@@ -105,8 +105,8 @@ class Isosurfaces(AbstractSurfaces):
         dt = self.step / finer * jnp.min(volume.spacing)
         occupancy = None if bricks is None else occupancy_of_values(bricks, volume.slope, volume.intercept, self.values)
         steepest = steepest_of(volume, BRICK) if self.guaranteed else None
-        tolerance = min(self.tolerance * finer / self.step, 0.5)
-        return Search(volume, self.values, dt, occupancy, self.band, steepest, tolerance, self.coarse)
+        tolerance = jnp.minimum(self.tolerance * jnp.min(volume.spacing), dt / 2)
+        return Search(volume, self.values, dt, tolerance, occupancy, self.band, steepest, self.coarse)
 
     def start(self, prepared: Search, rays: Rays) -> Reached:
         return start(prepared, rays)

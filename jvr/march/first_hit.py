@@ -15,7 +15,6 @@ and never more than one more than bisection.
 Its derivative is that of the implicit function `s(x(u)) = rho`: `du = (d rho - ds at fixed u) / (grad s . d)`.
 """
 
-import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -45,8 +44,7 @@ MISSING = -1
 class Search(eqx.Module):
     """What rays need to know to find the isosurfaces of a volume.
 
-    - `values`: isovalues, ascending; `dt`: world length between two samples; `tolerance`: how close a crossing is enclosed, in units of
-      `dt`;
+    - `values`: isovalues, ascending; `dt`: world length between two samples; `tolerance`: how closely a crossing is enclosed;
     - `occupancy`: bricks that may hold an isovalue, or `None` where none are skipped;
     - `band`: the scalar's distance from the isovalues from which `coarse` samples are one step; `None`: every sample is taken;
     - `steepest`: bounds on how the scalar changes along each axis of the grid, within a brick and its neighbours; `None`: not known.
@@ -55,10 +53,10 @@ class Search(eqx.Module):
     volume: Volume
     values: Float[Array, "n"]
     dt: Scalar
+    tolerance: Scalar
     occupancy: Occupancy | None
     band: Scalar | None = None
     steepest: "Steepest | None" = None
-    tolerance: float = eqx.field(static=True, default=1e-4)
     coarse: int = eqx.field(static=True, default=1)
 
     @property
@@ -228,15 +226,23 @@ class _Brackets(NamedTuple):
     steps: Int[Array, "rays"]
 
 
+class _Far(NamedTuple):
+    """What says how far a ray may go: the scalar of its last sample, where that is `known`, and up to which sample steps are small."""
+
+    s: Float[Array, "rays"]
+    known: Bool[Array, "rays"]
+    fine_until: Int[Array, "rays"]
+
+
 class _Progress(NamedTuple):
     """The state of a ray that is searched: its last sample and the side of it; `crossed`: one more than the side of the next, where that is
-    another, else 0. Where steps may be large: the scalar of the last sample, where that is `known`, and up to which sample they may not."""
+    another, else 0."""
 
     k: Int[Array, "rays"]
     side: Int[Array, "rays"]
     crossed: Int[Array, "rays"]
     steps: Int[Array, "rays"]
-    far: "tuple[()] | tuple[Float[Array, 'rays'], Bool[Array, 'rays'], Int[Array, 'rays']]"
+    far: _Far | None
 
 
 class _Way(NamedTuple):
@@ -253,7 +259,7 @@ def _brackets(search: Search, rays: Rays, reached: Reached) -> _Brackets:
 
     def begin(way: _Way) -> _Progress:
         zero = jnp.zeros_like(way.reached.k)
-        far = (jnp.zeros_like(way.rays.length), zero > 0, zero) if search.leaps else ()
+        far = _Far(jnp.zeros_like(way.rays.length), zero > 0, zero) if search.leaps else None
         return _Progress(way.reached.k, way.reached.side, zero, zero, far)
 
     def alive(way: _Way, progress: _Progress) -> Bool[Array, "rays"]:
@@ -264,27 +270,28 @@ def _brackets(search: Search, rays: Rays, reached: Reached) -> _Brackets:
         skipped = search.skip(way.rays, progress.k)
         k = jnp.minimum(progress.k + skipped, way.segments)
         stride = jnp.ones_like(k)
-        if progress.far:
-            s, known, fine_until = progress.far
-            stride = jnp.where(known & (skipped == 0) & (k >= fine_until), search.stride(way.rays, k, s), 1)
+        far = progress.far
+        if far is not None:
+            may = far.known & (skipped == 0) & (k >= far.fine_until)
+            stride = jnp.where(may, search.stride(way.rays, k, far.s), 1)
         following = jnp.minimum(k + stride, way.segments)
         s, side = search.sample(way.rays, jnp.minimum(following * search.dt, way.rays.length))
         sampled = on & (k < way.segments)
         crosses = sampled & (side != progress.side) & (side != MISSING) & (progress.side != MISSING)
-        passed, far = sampled & ~crosses, ()
-        if progress.far:
+        passed = sampled & ~crosses
+        if far is not None:
             # What a larger step has passed is looked at again.
             again = crosses & (following > k + 1)
             crosses = crosses & ~again
-            known = jnp.where(passed, True, known & (skipped == 0))
-            far = (jnp.where(passed, s, progress.far[0]), known, jnp.where(again, following, fine_until))
+            known = passed | (far.known & (skipped == 0))
+            far = _Far(jnp.where(passed, s, far.s), known, jnp.where(again, following, far.fine_until))
         k = jnp.where(passed, following, jnp.where(on, k, progress.k))
         side_before = jnp.where(passed, side, progress.side)
         crossed = jnp.where(crosses, side + 1, progress.crossed)
         return _Progress(k, side_before, crossed, progress.steps + sampled, far), None
 
     work = jnp.where(reached.on, jnp.maximum(segments - reached.k, 0), 0)
-    finish = lambda progress: progress._replace(far=())
+    finish = lambda progress: progress._replace(far=None)
     found, _ = wavefront_while(alive, advance, begin, finish, _Way(rays, segments, reached), None, work)
     there = found.crossed > 0
     # The lattice goes on behind a surface; what is in front of it is known.
@@ -316,8 +323,8 @@ class _Crossing(NamedTuple):
 
 def _enclosed(search: Search, rays: Rays, found: _Brackets) -> tuple[Float[Array, "rays"], Int[Array, "rays"]]:
     """The distance of each crossing, and how many samples that took."""
-    least = search.tolerance * search.dt
-    halvings = max(math.ceil(math.log2(1 / (2 * search.tolerance))), 0)
+    least = search.tolerance
+    halvings = jnp.maximum(jnp.ceil(jnp.log2(search.dt / (2 * least))), 0.0)
     tiny = jnp.finfo(rays.length.dtype).tiny
     surface = jnp.where(found.rises, found.side, found.side - 1)
     sign = jnp.where(found.rises, 1.0, -1.0).astype(rays.length.dtype)

@@ -118,4 +118,4 @@ def _resolved(prepared: Prepared, rays: Rays, seen: _Seen) -> Radiance:
     mean = lambda channels: sum(channels[1:], channels[0]) / len(channels)
     poison = jnp.where(jnp.isnan(rays.length), jnp.nan, 0.0)
     rgb = jnp.stack(seen.radiance, axis=-1) + poison[:, None]
-    return Radiance(rgb, mean(seen.opacity) + poison, mean(seen.distance), seen.steps)
+    return Radiance(rgb, jnp.asarray(mean(seen.opacity)) + poison, jnp.asarray(mean(seen.distance)), seen.steps)
