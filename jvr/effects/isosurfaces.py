@@ -114,7 +114,7 @@ class Isosurfaces(AbstractSurfaces):
     def next_hit(self, prepared: Search, rays: Rays, reached: Reached) -> Hits:
         return next_hit(prepared, rays, reached)
 
-    def shown(self, medium: Medium, rays: Rays, hits: Hits) -> tuple[Triple, Scalar]:
+    def shown(self, medium: Medium, rays: Rays, hits: Hits) -> tuple[Triple, Float[Array, "rays"]]:
         own = lambda column: jnp.where(hits.found, column[hits.surface], 0.0)
         colour = tuple(own(self.rgb[:, c]) for c in range(3))
         opacity = hits.found.astype(rays.length.dtype) if self.opacity is None else own(self.opacity)

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
+from jaxtyping import Array, Float
 
 from jvr.model.parts import AbstractPart, PlanEntry, spelling
 from jvr.names import Renamed
@@ -112,7 +113,7 @@ class AbstractSurfaces(AbstractPart):
         """Where rays meet one next, as `jvr.march.first_hit.Hits`; differentiable."""
 
     @abc.abstractmethod
-    def shown(self, medium: Any, rays: Any, hits: Any) -> tuple[Triple, Scalar]:
+    def shown(self, medium: Any, rays: Any, hits: Any) -> tuple[Triple, Float[Array, "rays"]]:
         """Radiance towards the eye of what rays meet in a medium, under the light that reaches it, and how opaque it is; 0 where they meet
         nothing."""
 

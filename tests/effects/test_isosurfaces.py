@@ -61,6 +61,7 @@ def test_a_surface_ends_rays_and_shows_its_colour():
     np.testing.assert_allclose(alone.depth, 16 + 8 - 2.75, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_ray_that_meets_no_surface_is_as_without():
     scene = jvr.Scene(jvr.Volume(ramp()), medium(0.3), background=BEHIND)
     beyond = dataclasses.replace(scene, surfaces=jvr.Isosurfaces([11.0], [[1, 1, 1]]))
@@ -86,7 +87,7 @@ def closed(opacity, values, sigma_t):
     return rgb, 1 - np.mean(T[0] * T[1] * T[2] * np.ones(3)) * (1 - a0) * (1 - a1)
 
 
-@pytest.mark.parametrize("sigma_t", [0.15, (0.05, 0.2, 0.6)], ids=["grey", "coloured"])
+@pytest.mark.parametrize("sigma_t", [0.15, pytest.param((0.05, 0.2, 0.6), marks=pytest.mark.slow)], ids=["grey", "coloured"])
 def test_translucent_layers_are_blended_at_their_place(sigma_t):
     """`L <- L1 + T1 (a c + (1 - a) L2)`, with opacities 0 and 1 as its ends, and where they are 1e-4 voxels apart."""
     for opacity in ((0.3, 0.6), (0.0, 1.0), (1.0, 0.0), (0.0, 0.0)):
@@ -100,6 +101,7 @@ def test_translucent_layers_are_blended_at_their_place(sigma_t):
     np.testing.assert_allclose(one, closed((0.0, 0.6), (2.25, 6.75), sigma_t)[0], rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_opaque_surfaces_are_translucent_ones_of_opacity_one():
     values = ball()
     scene = jvr.Scene(jvr.Volume(values), medium(0.1), background=BEHIND)
@@ -118,10 +120,11 @@ def lit(surfaces, **parts):
     return jvr.Scene(jvr.Volume(ball()), surfaces=surfaces, background=BEHIND, **parts)
 
 
+@pytest.mark.slow
 def test_a_lit_ball_is_lambert_s():
     """Its normals are known, but for what the interpolant of distances is wrong by; a threshold of the gradient has no say."""
     surfaces, camera = jvr.Isosurfaces([-4.5], [[1.0, 0.5, 0.25]]), from_above(jvr.Volume(ball()), 9, 7.0)
-    found = picture(lit(surfaces, shading=jvr.Lambert(threshold=50.0)), camera)
+    found = picture(lit(surfaces, shading=jvr.Lambert(threshold=50.0), normals=jvr.CentralDifferences()), camera)
     offset = (np.arange(9) + 0.5) / 9 * 7 - 3.5
     x, y = np.meshgrid(offset, -offset)
     z = np.sqrt(4.5**2 - x**2 - y**2, where=x**2 + y**2 < 4.5**2, out=np.full((9, 9), np.nan))
@@ -129,10 +132,11 @@ def test_a_lit_ball_is_lambert_s():
     cosine = np.maximum((x * w_i[0] + y * w_i[1] + z * w_i[2]) / 4.5, 0)
     wanted = cosine[..., None] * np.array([1.2, 0.5, 0.2])
     inside = np.isfinite(z) & (z > 1.5)
-    np.testing.assert_allclose(np.asarray(found.rgb)[inside], wanted[inside], atol=0.06)
-    assert np.abs(np.asarray(found.rgb)[inside] - wanted[inside]).mean() < 0.02
+    np.testing.assert_allclose(np.asarray(found.rgb)[inside], wanted[inside], atol=0.03)
+    assert np.abs(np.asarray(found.rgb)[inside] - wanted[inside]).mean() < 0.01
 
 
+@pytest.mark.slow
 def test_a_surface_lies_in_the_shadow_of_the_medium():
     """A slab between it and a light that shines straight down takes the same light everywhere."""
     values = ramp()
@@ -151,6 +155,7 @@ def smooth(shape=(8, 9, 8)):
     return np.sin(0.5 * x + 0.3) + np.cos(0.45 * y) + 0.3 * z - 0.05 * x * z
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("opacity", [None, (0.6, 0.8)], ids=["opaque", "blended"])
 def test_derivatives_match_differences(x64, opacity):
     """In isovalues, colours, voxels, light and pose, in both modes and under `vmap`, at pixels that meet the same surfaces on both sides of
@@ -160,15 +165,16 @@ def test_derivatives_match_differences(x64, opacity):
     scene = jvr.Scene(
         volume,
         jvr.LinearTransfer([-1, 3], [[0.3, 0.8, 0.2], [0.9, 0.3, 0.5]], [0.02, 0.2]),
-        lights=[jvr.DirectionalLight([0.6, 0.3, -1.0])],
-        shading=jvr.Lambert(0.3, 0.7),
         background=BEHIND,
         surfaces=surfaces,
     )
+    if opacity is None:
+        light = jvr.DirectionalLight([0.6, 0.3, -1.0])
+        scene = dataclasses.replace(scene, lights=(light,), shading=jvr.Lambert(0.3, 0.7))
     camera = jvr.PerspectiveCamera.look_at([20, -9, 12], [3.5, 4, 3.5], [0, 0, 1], 24, 7, 6)
-    where = lambda s, c: (s.surfaces.values, s.surfaces.rgb, s.volume.values, s.lights[0].direction, c.world_from_camera)
+    where = lambda s, c: (s.surfaces, s.volume.values, s.lights, c.world_from_camera)
     base, rng = where(scene, camera), np.random.default_rng(0)
-    tangents = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), base)
+    tangents = jax.tree.map(lambda x: jnp.asarray(0.5 * rng.normal(size=x.shape)), base)
     tangents = (*tangents[:-1], tangents[-1].at[3].set(0))
 
     def seen(arrays):
@@ -185,12 +191,13 @@ def test_derivatives_match_differences(x64, opacity):
     np.testing.assert_allclose(np.asarray(along)[steady], np.asarray(difference)[steady], rtol=2e-4, atol=2e-5)
     weights = jnp.asarray(rng.normal(size=along.shape) * steady[..., None])
     pull = jax.jit(lambda w: jax.vjp(seen, base)[1](w)[0])
-    products = lambda gradient: sum(jnp.sum(g * t) for g, t in zip(gradient, tangents, strict=True))
+    products = lambda gradient: sum(jnp.sum(g * t) for g, t in zip(*map(jax.tree.leaves, (gradient, tangents)), strict=True))
     np.testing.assert_allclose(products(pull(weights)), jnp.sum(weights * along), rtol=1e-8)
     both = jax.vmap(pull)(jnp.stack([weights, -3 * weights]))
-    np.testing.assert_allclose(both[0][1], -3 * pull(weights)[0], rtol=1e-8)
+    np.testing.assert_allclose(both[1][1], -3 * pull(weights)[1], rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_rows_and_second_derivatives_follow(x64):
     surfaces = jvr.Isosurfaces([2.3], [[0.9, 0.4, 0.2]])
     scene = jvr.Scene(jvr.Volume(ramp()), medium(0.2), background=BEHIND, surfaces=surfaces)
@@ -208,6 +215,7 @@ def test_rows_and_second_derivatives_follow(x64):
     np.testing.assert_allclose(twice, 0.2 * slope, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_nothing_is_seen_inside_of_an_opaque_medium():
     """And nothing there has a derivative that is not finite."""
     scene = jvr.Scene(jvr.Volume(ramp()), medium(1e6), surfaces=jvr.Isosurfaces([2.5], [[1.0, 0.0, 0.0]], [0.5]))
@@ -220,6 +228,7 @@ def test_nothing_is_seen_inside_of_an_opaque_medium():
     assert not np.any(gradient.surfaces.rgb)
 
 
+@pytest.mark.slow
 def test_isovalue_colour_and_opacity_are_found_from_pictures():
     """With standard errors, from pictures with noise."""
     truth = jvr.Isosurfaces([-4.5], [[0.8, 0.5, 0.3]], [0.7], most=2)

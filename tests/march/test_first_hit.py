@@ -242,10 +242,15 @@ def test_hard_cases_are_finite():
 
 def test_a_hit_in_the_last_half_segment_is_found():
     """The last sample is where the ray leaves, and what is missing hides what is there."""
-    values = grid((4, 4, 8))[2]
-    rays = Rays((jnp.ones(1), jnp.ones(1), jnp.zeros(1)), (jnp.zeros(1), jnp.zeros(1), jnp.ones(1)), jnp.full(1, 7.0))
-    for level in (6.999, 7.0, 6.6):
-        np.testing.assert_allclose(found(first(search_of(values, [level], step=2.0), rays)), level, atol=2e-4)
+    values, rays = grid()[2], rays_through(axes=(2,))
+    up = np.asarray(rays.direction[2]) > 0
+    for level in (9.999, 9.6):
+        depth = found(first(search_of(values, [level], step=2.0), rays)) * np.asarray(rays.direction[2])
+        np.testing.assert_allclose(depth[up], level, atol=2e-4)
     values[:, :, 3] = np.nan
-    hit = lambda level: bool(first(search_of(values, [level], step=0.5), rays).found[0])
-    assert [hit(level) for level in (1.3, 2.6, 3.4, 5.2)] == [True, False, False, True]
+    hit = lambda level: np.asarray(first(search_of(values, [level], step=0.5), rays).found)[up]
+    assert [(hit(level).all(), hit(level).any()) for level in (1.3, 2.6, 3.4, 5.2)] == [
+        (True, True),
+        *[(False, False)] * 2,
+        (True, True),
+    ]
