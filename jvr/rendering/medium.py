@@ -40,7 +40,7 @@ class Prepared(NamedTuple):
     - `scene`: near its volume (`jvr.rendering.trace.near_volume`);
     - `settings`: how it is rendered, all but the step, which is 1 here;
     - `dt`: the world length of a segment;
-    - `occupancy`, `visibility`, `lighting`, `surfaces`: visible bricks, what is in the way of light, what the shader of light computes for
+    - `occupancy`, `visibility`, `lighting`, `search`: visible bricks, what is in the way of light, what the shader of light computes for
       all rays, and what these need to find surfaces, each `None` where the scene asks for none.
     """
 
@@ -50,7 +50,7 @@ class Prepared(NamedTuple):
     occupancy: Occupancy | None = None
     visibility: AbstractVisibility | None = None
     lighting: Any = None
-    surfaces: Any = None
+    search: Any = None
 
     @property
     def shadow_stats(self) -> Any:
@@ -70,10 +70,10 @@ def prepare(
     occupied = occupancy(scene, settings) if skips else None
     visible = visibility(scene, occupied) if visible is None else visible
     lighting = _lighting().prepare(scene) if scene.shows_light else None
-    surfaces = None
+    search = None
     if scene.surfaces is not None:
-        surfaces = scene.surfaces.prepare(scene, bricks(scene.volume) if settings.skipping else None)
-    return Prepared(scene, dataclasses.replace(settings, step=1.0), dt, occupied, visible, lighting, surfaces)
+        search = scene.surfaces.prepare(scene, bricks(scene.volume) if settings.skipping else None)
+    return Prepared(scene, dataclasses.replace(settings, step=1.0), dt, occupied, visible, lighting, search)
 
 
 def medium(prepared: Prepared) -> Medium:

@@ -22,7 +22,7 @@ def ended_at_surfaces(prepared: Prepared, medium: Medium, rays: Rays) -> tuple[R
     surfaces = prepared.scene.surfaces
     assert surfaces is not None
     way = rays.without_end
-    hits = surfaces.next_hit(prepared.surfaces, way, surfaces.start(prepared.surfaces, way))
+    hits = surfaces.next_hit(prepared.search, way, surfaces.start(prepared.search, way))
     rgb, opaque = surfaces.shown(medium, way, hits)
     end = End(rgb, opaque, hits.u)
     if rays.end is not None:
@@ -52,12 +52,12 @@ def blended_with_surfaces(prepared: Prepared, medium: Medium, rays: Rays) -> Rad
     zero = jnp.zeros_like(rays.length)
     n = max(channel_counts(medium, way, prepared.dt)[1], 1)
     # Not alive, but not to be lost either: a ray that is no number is marched, and brings none.
-    none, start = jnp.zeros_like(rays.length, jnp.int32), surfaces.start(prepared.surfaces, way)
+    none, start = jnp.zeros_like(rays.length, jnp.int32), surfaces.start(prepared.search, way)
     seen = _Seen((zero,) * 3, (zero + 1,) * n, (zero,) * n, (zero,) * n, zero, none == 0, start, none)
 
     def stretch(seen: _Seen, index: Int[Array, ""]) -> tuple[_Seen, None]:
         on = seen.on & (index < surfaces.most) & seen.reached.on
-        hits = surfaces.next_hit(prepared.surfaces, way, seen.reached._replace(on=on))
+        hits = surfaces.next_hit(prepared.search, way, seen.reached._replace(on=on))
         end = jnp.where(hits.found, hits.u, way.length)
         entry = tuple(e + seen.u * d for e, d in zip(way.entry, way.direction, strict=True))
         part = Rays(entry, way.direction, jnp.where(seen.on, end - seen.u, 0.0))
