@@ -155,6 +155,7 @@ SCENES = {
     "natural": lambda: natural(radiance_transfer=jvr.RadianceTransfer(exact=True)),
     "isosurfaces": lambda: lit(surfaces=jvr.Isosurfaces((0.4, 0.6), voxels((2, 3)), (0.3, 1.0), band=0.2, step=0.5, most=2)),
     "negative": lambda: natural(environment=jvr.EnvironmentLight(-0.0 * np.ones((4, 3)), clamped=False)),
+    "seen": lambda: natural(environment=(sky := jvr.EnvironmentMap(voxels((4, 8, 3)), order=2)), background=sky),
     "materials": materials,
     "projected": projected,
     "frozen": frozen,
