@@ -37,6 +37,8 @@ FIRST_SKIPS = 8
 FINER = 32
 # A ray that crosses a surface under a smaller angle than this (its sine) has the derivative of this angle.
 LEAST_SINE = 1e-3
+# The fraction of rays that may idle while others are searched, and while crossings are enclosed: both take few steps.
+IDLE_SEARCH, IDLE_ENCLOSED = 0.5, 0.8
 # The side of a point where there are no data.
 MISSING = -1
 
@@ -292,7 +294,7 @@ def _brackets(search: Search, rays: Rays, reached: Reached) -> _Brackets:
 
     work = jnp.where(reached.on, jnp.maximum(segments - reached.k, 0), 0)
     finish = lambda progress: progress._replace(far=None)
-    found, _ = wavefront_while(alive, advance, begin, finish, _Way(rays, segments, reached), None, work)
+    found, _ = wavefront_while(alive, advance, begin, finish, _Way(rays, segments, reached), None, work, IDLE_SEARCH)
     there = found.crossed > 0
     # The lattice goes on behind a surface; what is in front of it is known.
     front = jnp.maximum(jnp.minimum(found.k * search.dt, rays.length), jnp.where(reached.on, reached.u, 0.0))
@@ -355,7 +357,7 @@ def _enclosed(search: Search, rays: Rays, found: _Brackets) -> tuple[Float[Array
     def finish(state: _Enclosed) -> tuple[Float[Array, "rays"], Int[Array, "rays"]]:
         return _secant(state), state.steps
 
-    (u, steps), _ = wavefront_while(alive, advance, begin, finish, crossing, None, found.there.astype(jnp.int32))
+    (u, steps), _ = wavefront_while(alive, advance, begin, finish, crossing, None, found.there.astype(jnp.int32), IDLE_ENCLOSED)
     return u, steps
 
 
