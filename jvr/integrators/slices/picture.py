@@ -116,6 +116,8 @@ def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
         raise ValueError(f"jvr.Slices() does not know light: {UNIFORM}, or take shading and scattering out of the scene")
     if scene.surfaces is not None:
         raise ValueError(f"jvr.Slices() does not know surfaces: {UNIFORM}")
+    if scene.geometry is not None:
+        raise ValueError(f"jvr.Slices() does not know geometry, at whose edges rays end apart: {UNIFORM}")
     if not isinstance(settings.adjoint, Replay):
         raise ValueError(
             f"jvr.Slices() needs Settings(adjoint=jvr.Replay()), not jvr.{type(settings.adjoint).__name__}(): {UNIFORM}"
