@@ -40,8 +40,8 @@ class Mesh(AbstractGeometry):
     **Raises** `ValueError` for a mesh without faces, vertices that are not finite and faces of vertices that there are not.
     """
 
-    vertices: Float[Array, "vertices 3"] = parameter(doc="x, y, z", unit="mm")
     faces: Int[Array, "faces 3"]
+    vertices: Float[Array, "vertices 3"] = parameter(doc="x, y, z", unit="mm")
     rgb: Float[Array, "..."] = parameter(RADIANCE, doc="radiance of each vertex, or of all", shapes=(("vertices", 3), (3,)))
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, rgb: ArrayLike):
@@ -73,10 +73,10 @@ class Mesh(AbstractGeometry):
 
 
 class _Blocks(NamedTuple):
-    """Triangles in blocks, `BLOCK` each, whose places are near each other: their corners, their indices, and the box around each block."""
+    """Triangles in blocks, `BLOCK` each, whose places are near each other: their corners, their numbers, and the box around each block."""
 
     corners: Float[Array, "blocks triangles 3 3"]
-    index: Int[Array, "blocks triangles"]
+    number: Int[Array, "blocks triangles"]
     lower: Float[Array, "blocks 3"]
     upper: Float[Array, "blocks 3"]
 
@@ -116,7 +116,7 @@ def _look_at(best: _Best, block: _Blocks, some: _Some) -> _Best:
     t = jnp.where((least >= -EDGE) & (t >= nearest), t, jnp.inf)
     one = jnp.argmin(t, axis=0)
     nearer = jnp.min(t, axis=0)
-    return jnp.minimum(nearer, best[0]), jnp.where(nearer < best[0], block.index[one], best[1])
+    return jnp.minimum(nearer, best[0]), jnp.where(nearer < best[0], block.number[one], best[1])
 
 
 def _components(corners: Float[Array, "*many 3 3"]) -> tuple[Triple, ...]:

@@ -257,6 +257,7 @@ FORBIDDEN = {
 UNDECLARED = {
     ("HarmonicMaterial", "tinted"): "made by project",
     ("HarmonicMaterial", "plain"): "made by project",
+    ("Mesh", "faces"): "whole numbers, checked on their own",
     ("PrecomputedGradient", "gradients"): "made of a volume",
     ("Volume", "values"): "voxels of any type, checked on their own",
     ("Volume", "world_from_grid"): "an affine transform, checked on its own",
