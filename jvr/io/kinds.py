@@ -45,7 +45,12 @@ KINDS: dict[type, dict[str, str]] = {
         "head": "HeadLight",
         "ambient": "AmbientLight",
     },
-    AbstractShading: {"lambert": "Lambert", "phong": "Phong", "blinn-phong": "BlinnPhong"},
+    AbstractShading: {
+        "lambert": "Lambert",
+        "phong": "Phong",
+        "blinn-phong": "BlinnPhong",
+        "phenomenological": "PhenomenologicalBSDF",
+    },
     AbstractShadows: {
         "rays": "ShadowRays",
         "volume": "ShadowVolume",

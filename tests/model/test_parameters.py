@@ -226,6 +226,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
         "principal_point": (0.5, 1.5),
     },
     "PhaseBRDF": {"phase": jvr.Isotropic()},
+    "PhenomenologicalBSDF": {},
     "Phong": {},
     "PhongBRDF": {},
     "PointLight": {"position": [0.0, 0.0, 1.0], "attenuation": [1.0, 0.5, 0.5]},
