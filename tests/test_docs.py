@@ -32,6 +32,7 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.effects import AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
 from jvr.model.environment_map import EnvironmentMap
+from jvr.model.geometry import AbstractGeometry
 from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
@@ -107,7 +108,13 @@ def pages_with(found: list[pages.Block], *slow: str) -> list:
 @pytest.mark.parametrize(
     "page",
     pages_with(
-        pages.blocks("python"), "README.md", "docs/environment_lighting.md", "docs/fitting.md", "docs/light.md", "docs/voxels.md"
+        pages.blocks("python"),
+        "README.md",
+        "docs/environment_lighting.md",
+        "docs/fitting.md",
+        "docs/light.md",
+        "docs/surfaces.md",
+        "docs/voxels.md",
     ),
 )
 def test_code_runs(page, desk):
@@ -173,6 +180,7 @@ FAMILIES = {
     "[normals]": AbstractNormals,
     "[material]": AbstractBRDF,
     "[background]": EnvironmentMap,
+    "[geometry]": AbstractGeometry,
     "[environment]": EnvironmentLight,
     "[camera]": AbstractCamera,
     "[settings.quadrature]": AbstractQuadrature,
@@ -208,7 +216,7 @@ def test_the_reference_has_every_public_name():
     assert "settings=Settings()" in text
     assert "py:function} jvr.sh.project(" in text
     assert "py:function} jvr.presets.ct()" in text
-    assert "py:classmethod} look_at(eye, target, up, fov_y, width, height)" in text
+    assert "py:classmethod} look_at(eye, target, up, fov_y, width, height, *, near=None, far=None)" in text
     # Tables of functions and methods, and what configurations call them.
     orbit, disc = (text.split(head)[1].split("::::")[0] for head in ("jvr.orbit(", "classmethod} disc("))
     assert "| `axis` | x, y, z; what is up in every picture | (3,) | a direction of any length but zero | `(0, 0, 1)` |" in orbit

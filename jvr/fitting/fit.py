@@ -26,7 +26,7 @@ from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.minimisers import OptimistixSolver
 from jvr.fitting.objective import check_derivatives
-from jvr.fitting.observations import check_settings, is_mostly_empty
+from jvr.fitting.observations import check_settings, check_views, is_mostly_empty
 from jvr.fitting.problem import Problem
 from jvr.fitting.reach import known_background, say_what_is_out_of_reach
 from jvr.fitting.result import FitResult, FitStats, Iteration
@@ -128,6 +128,7 @@ def fit(
     targets, weights = given = targets_of(cameras, images, weights, behind)
     lights = lights_of(lights, cameras)
     held = None if held_out is None else _held_out(held_out, behind)
+    check_views(scene, (*views, *(() if held is None else held[0])))
     start = chosen.model_from_unconstrained(model, chosen.unconstrained_from_model(model))
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
     forwards = _check(problem, solver, given, coarse_levels)
