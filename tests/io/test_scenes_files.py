@@ -64,6 +64,10 @@ def lights() -> jvr.Scene:
     return lit(lights=every, shading=shading, shadows=jvr.ShadowRays(2, termination=0.01))
 
 
+def shells() -> jvr.Scene:
+    return lit(shading=jvr.PhenomenologicalBSDF(0.4, by_value(0.1, 0.2), 0.3, 12.0, 7.0, 1.3, normalised=False, threshold=0.2))
+
+
 def phases() -> jvr.Scene:
     every = [jvr.Isotropic(), jvr.Rayleigh(), jvr.HenyeyGreenstein((0.1, 0.2, -0.3)), jvr.Schlick(0.4), jvr.JendersieEon(12.0)]
     every += [
@@ -138,6 +142,7 @@ SCENES = {
     "replaced": replaced,
     "traced": lambda: jax.jit(lambda values: scene(jvr.Volume(values, OBLIQUE)))(with_gaps()),
     "lights": lights,
+    "shells": shells,
     "phases": phases,
     "gradient opacity": lambda: lit(
         transfer=jvr.GradientOpacity(linear_transfer(coloured=True), 0.1, 0.7),
