@@ -79,6 +79,7 @@ if TYPE_CHECKING:
     from jvr.model.camera import fibonacci_sphere as fibonacci_sphere
     from jvr.model.camera import orbit as orbit
     from jvr.model.clipping import ClippingBox as ClippingBox
+    from jvr.model.clipping import ClippingPlane as ClippingPlane
     from jvr.model.dipole import Dipole as Dipole
     from jvr.model.environment import EnvironmentLight as EnvironmentLight
     from jvr.model.gradient_transfer import GradientOpacity as GradientOpacity

@@ -68,7 +68,7 @@ NAMES = {
     "jvr.model.brdf": ("BlinnPhongBRDF", "LambertBRDF", "PhaseBRDF", "PhongBRDF"),
     "jvr.model.by_value": ("ByValue",),
     "jvr.model.camera": ("OrthographicCamera", "PerspectiveCamera", "PinholeCamera", "fibonacci_sphere", "orbit"),
-    "jvr.model.clipping": ("ClippingBox",),
+    "jvr.model.clipping": ("ClippingBox", "ClippingPlane"),
     "jvr.model.dipole": ("Dipole",),
     "jvr.model.environment": ("EnvironmentLight",),
     "jvr.model.gradient_transfer": ("GradientOpacity", "GradientTransfer"),

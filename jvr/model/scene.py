@@ -7,7 +7,7 @@ from typing import Any
 
 import equinox as eqx
 
-from jvr.model.clipping import ClippingBox
+from jvr.model.clipping import AbstractClipping, ClippingBox
 from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer, AbstractScattering, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
 from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
@@ -30,7 +30,7 @@ class Scene(AbstractPart):
     - `transfer`: a transfer function, `jvr.LinearTransfer`, `jvr.LutTransfer` or `jvr.GaussianTransfer`.
     - `background`: `(3,)` linear RGB that shows through what is transparent, or `None`.
     - `optical`: `jvr.EmissionAbsorption()` (default), `jvr.EmissionOnly()` or `jvr.AbsorptionOnly()`.
-    - `clipping`: `jvr.ClippingBox` or `None`.
+    - `clipping`: what is left of the volume: `jvr.ClippingBox`, `jvr.ClippingPlane`, several of them in a row, or `None`: all of it.
     - `lights`: any number of `jvr.DirectionalLight`, `jvr.PointLight`, `jvr.SpotLight`, `jvr.HeadLight`, `jvr.AmbientLight` and
       `jvr.EnvironmentLight`.
     - `shading`: what surfaces make of light: `jvr.Lambert`, `jvr.Phong`, `jvr.BlinnPhong`, or `None`: the medium glows as it is.
@@ -52,7 +52,10 @@ class Scene(AbstractPart):
     transfer: AbstractTransfer = parameter(doc="one of jvr's")
     background: Vector | None = parameter(COLOUR, doc="red, green, blue, linear")
     optical: AbstractOpticalModel = parameter(doc="one of jvr's")
-    clipping: ClippingBox | None = parameter(doc="a jvr.ClippingBox")
+    # The first class is that of a file that names none.
+    clipping: ClippingBox | AbstractClipping | tuple[ClippingBox | AbstractClipping, ...] | None = parameter(
+        doc="a jvr.ClippingBox, a jvr.ClippingPlane or a sequence of them"
+    )
     lights: tuple[AbstractLight, ...] = parameter(doc="a sequence of jvr's lights")
     shading: AbstractShading | None = parameter(doc="one of jvr's")
     shadows: AbstractShadows | None = parameter(doc="one of jvr's")
@@ -69,7 +72,7 @@ class Scene(AbstractPart):
         *,
         background: ArrayLike | None = None,
         optical: AbstractOpticalModel = EmissionAbsorption(),
-        clipping: ClippingBox | None = None,
+        clipping: AbstractClipping | Sequence[AbstractClipping] | None = None,
         lights: Sequence[AbstractLight] = (),
         shading: AbstractShading | None = None,
         shadows: AbstractShadows | None = None,
@@ -79,6 +82,8 @@ class Scene(AbstractPart):
         material: AbstractMaterial | None = None,
         radiance_transfer: AbstractRadianceTransfer | None = None,
     ):
+        # None of several is no clipping.
+        clipping = clipping if isinstance(clipping, AbstractClipping) or clipping else None
         assign(self, volume=volume, transfer=transfer, background=background, optical=optical, clipping=clipping)
         assign(self, lights=lights, shading=shading, shadows=shadows, scattering=scattering, normals=normals)
         assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer)

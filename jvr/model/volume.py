@@ -21,7 +21,7 @@ from jvr.model.packing import Squares, squares_of
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.voxels import VOXEL, as_missing, in_memory, masked_voxels, typical_range, without_gaps
-from jvr.numerics import add_runs, read_at, read_run, transformed, turned
+from jvr.numerics import add_runs, inverse_of_axes, read_at, read_run, transformed, turned
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
 
 
@@ -267,11 +267,7 @@ class Volume(AbstractPart):
         return read_at(self.gaps.reshape(-1), start) & self.interpolation.gap == 0
 
     def grid_from_world(self, x: Triple, *, direction: bool = False) -> Triple:
-        """Grid position of a world position, or with `direction=True` grid displacement of a world displacement.
-
-        Rows of the inverse are cross products of the axes, each scaled to unit length first: a spacing ratio of 1 : 1000 or
-        a world in kilometres costs no digits, as a general float32 inverse would.
-        """
+        """Grid position of a world position, or with `direction=True` grid displacement of a world displacement."""
         if not direction:
             x = tuple(x[i] - self.world_from_grid[i, 3] for i in range(3))
         return turned(self.axes_inverse, x)
@@ -283,10 +279,7 @@ class Volume(AbstractPart):
     @property
     def axes_inverse(self) -> Float[Array, "3 3"]:
         """Inverse of the linear part of `world_from_grid`; its transpose takes derivatives along the grid's axes to the world."""
-        lengths = self.spacing
-        a, b, c = (self.world_from_grid[:3, :3] / lengths).T
-        rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
-        return rows / (jnp.dot(a, rows[0]) * lengths[:, None])
+        return inverse_of_axes(self.world_from_grid[:3, :3])
 
     def deposit(self, total: "Volume", p: Triple, of_value: Float[Array, "points"], of_gradient: Triple = ()) -> "Volume":
         """Adds the derivative of `sum(of_value * s + of_gradient . grad s)` over a batch of grid positions to `total`, in place where

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from jvr.march.march import Marched
 from jvr.march.steps import Rays
 from jvr.model.camera import AbstractCamera
-from jvr.model.clipping import interval_inside
+from jvr.model.clipping import interval_inside, moved_clipping
 from jvr.model.scene import Scene
 from jvr.numerics import larger, one_minus_exp
 from jvr.types import Scalar, Triple
@@ -40,8 +40,7 @@ def near_volume(scene: Scene, *others: Any) -> Any:
     origin = jax.lax.stop_gradient(scene.volume.origin)
     placed = lambda s: (s.volume, s.clipping, s.lights)
     lights = tuple(light.moved(origin) for light in scene.lights)
-    clipping = None if scene.clipping is None else scene.clipping.moved(origin)
-    parts = (scene.volume.moved(origin), clipping, lights)
+    parts = (scene.volume.moved(origin), moved_clipping(scene.clipping, origin), lights)
     scene = eqx.tree_at(placed, scene, parts, is_leaf=lambda x: x is None)
     return scene, *(camera.moved(origin) for camera in cameras)
 
@@ -62,7 +61,7 @@ def step_length(scene: Scene, settings: "Settings") -> Scalar:
 def enter(
     scene: Scene, origin: Triple, direction: Triple, behind: Float[Array, "rays"] | float = 0.0
 ) -> tuple[Rays, Float[Array, "rays"]]:
-    """World rays inside the volume (and its clipping box), and the distance from the eye, which is `behind` their origin by so much, to
+    """World rays inside the volume (and its clipping), and the distance from the eye, which is `behind` their origin by so much, to
     where they enter.
 
     A ray with non-finite numbers gets the length NaN, which `composite` turns into a NaN pixel.
