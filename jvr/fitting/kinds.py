@@ -133,12 +133,12 @@ def adjoint_of(problem: Problem) -> AbstractAdjoint:
 
 
 def _has_rows(problem: Problem) -> bool:
-    return problem.integrator.marches and has_table_jacobian(problem.model.scene)
+    return problem.marches and has_table_jacobian(problem.model.scene)
 
 
 def _after_march(problem: Problem) -> frozenset[int]:
     """Which unknowns act on what a march has gathered, and not on the way."""
-    return problem.unknowns.among(problem.model, read_after_march) if problem.integrator.marches else frozenset()
+    return problem.unknowns.among(problem.model, read_after_march) if problem.marches else frozenset()
 
 
 def has_table_jacobian(scene: Scene) -> bool:

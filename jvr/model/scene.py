@@ -109,6 +109,10 @@ class Scene(AbstractPart):
         return self.shows_lights or any(part.shows_environment for _, part in parts_of(self))
 
     @property
+    def ends_rays(self) -> bool:
+        return any(part.ends_rays for _, part in parts_of(self))
+
+    @property
     def environment_lights(self) -> tuple[EnvironmentLight, ...]:
         """Its environment and those among its lights."""
         return _environments(self.lights, self.environment)

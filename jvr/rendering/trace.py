@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jvr.march.march import Marched
-from jvr.march.steps import Rays
+from jvr.march.steps import End, Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.clipping import interval_inside, moved_clipping
 from jvr.model.scene import Scene
@@ -85,14 +85,30 @@ def camera_rays(scene: Scene, camera: AbstractCamera, pixels: Int[Array, "rays"]
     return enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)))
 
 
-def composite(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> tuple[Triple, Float[Array, "rays"]]:
-    """Colour of each ray with the background behind the medium, and the medium's opacity."""
+def composite(scene: Scene, gathered: Marched, rays: Rays) -> tuple[Triple, Float[Array, "rays"]]:
+    """Colour of each ray with what is behind the medium, and the opacity of the medium and of what is opaque behind it."""
     transmittances = tuple(jnp.exp(-tau) for tau in gathered.tau)
-    zero = jnp.where(jnp.isnan(length), jnp.nan, 0.0)
+    zero = jnp.where(jnp.isnan(rays.length), jnp.nan, 0.0)
     rgb = tuple(zero + L for L in gathered.radiance or (0.0, 0.0, 0.0))
-    if scene.background is not None:
+    behind = _behind(scene, rays)
+    if behind is not None:
         clear = transmittances * (3 // len(transmittances)) if transmittances else (1.0, 1.0, 1.0)
-        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, scene.background, strict=True))
+        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, behind, strict=True))
     # Not 1 - T: thin media keep their digits.
     alpha = sum((one_minus_exp(tau) for tau in gathered.tau), zero) / max(len(gathered.tau), 1)
-    return rgb, alpha
+    return rgb, alpha if rays.end is None else alpha + seen_end(gathered, rays.end)
+
+
+def seen_end(gathered: Marched, end: End) -> Float[Array, "rays"]:
+    """How much is seen of what is opaque behind the medium, the mean over channels."""
+    transmittances = [jnp.exp(-tau) for tau in gathered.tau]
+    return end.opaque * (sum(transmittances, jnp.zeros_like(end.opaque)) / len(transmittances) if transmittances else 1.0)
+
+
+def _behind(scene: Scene, rays: Rays) -> Any:
+    """Radiance behind the medium in three channels, or `None` where there is none."""
+    if rays.end is None:
+        return scene.background
+    if scene.background is None:
+        return rays.end.rgb
+    return tuple(c + (1 - rays.end.opaque) * b for c, b in zip(rays.end.rgb, scene.background, strict=True))

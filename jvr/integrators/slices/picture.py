@@ -99,7 +99,7 @@ def picture_of(view: View, sampling: Slices, *, distances: DistanceField | None 
     gathered, ended, samples = marched
 
     crop = lambda x: x.reshape(*options.shape(0), *x.shape[1:])[1 : camera.height + 1, 1 : camera.width + 1]
-    found = radiance_of(scene, gathered, finest.length)
+    found = radiance_of(scene, gathered, finest)
     rgb, alpha, depth, steps = jax.tree.map(crop, (found.rgb, found.alpha, found.depth(t_in), found.steps))
     full = jnp.where(lattice.last >= 0, jnp.minimum(ended, lattice.last) - lattice.first + 1, 0)
     return Rendering(rgb, alpha, depth, RenderStats(steps, SliceStats(samples, jnp.sum(full, dtype=jnp.int32))))
