@@ -85,6 +85,7 @@ if TYPE_CHECKING:
     from jvr.model.gradient_transfer import GradientOpacity as GradientOpacity
     from jvr.model.gradient_transfer import GradientTransfer as GradientTransfer
     from jvr.model.interpolation import Nearest as Nearest
+    from jvr.model.interpolation import Tricubic as Tricubic
     from jvr.model.interpolation import Trilinear as Trilinear
     from jvr.model.light import AmbientLight as AmbientLight
     from jvr.model.light import DirectionalLight as DirectionalLight

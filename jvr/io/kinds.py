@@ -97,7 +97,7 @@ KINDS: dict[type, dict[str, str]] = {
         "absorption-only": "AbsorptionOnly",
     },
     AbstractClipping: {"box": "ClippingBox", "plane": "ClippingPlane"},
-    AbstractInterpolation: {"trilinear": "Trilinear", "nearest": "Nearest"},
+    AbstractInterpolation: {"trilinear": "Trilinear", "tricubic": "Tricubic", "nearest": "Nearest"},
     AbstractCamera: {
         "perspective": "PerspectiveCamera",
         "orthographic": "OrthographicCamera",

@@ -18,7 +18,7 @@ from jvr.march.medium import DENSEST, AbstractVisibility, Medium, Visibilities
 from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.quadrature import PreIntegrated
 from jvr.march.shaders import GradientFrame, LightPathShader, OpticalShader, PreIntegratedShader
-from jvr.model.bricks import bricks_of
+from jvr.model.bricks import bricks_of, widened
 from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbsorptionOnly
 from jvr.model.parts import parts_of
@@ -132,6 +132,8 @@ def occupancy(scene: Scene, settings: "Settings") -> Occupancy | None:
         with jax.ensure_compile_time_eval():
             bricks = volume.bricked().bricks
     assert bricks is not None
+    if volume.interpolation.reach:
+        bricks = widened(bricks)
     # No ray is longer than the volume's diameter, so that the optical depth of all that is skipped stays below the bound.
     least = jax.lax.stop_gradient(settings.negligible / (2 * volume.radius)) if settings.negligible else None
     return occupancy_of(bricks, volume.slope, volume.intercept, scene.transfer, least)
