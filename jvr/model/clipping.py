@@ -30,7 +30,7 @@ class AbstractClipping(AbstractPart):
     """A convex region of the world; what lies outside of it is not rendered."""
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        return (PlanEntry(name, True, "rays are cut"),)
+        return (PlanEntry(name, True, f"rays are cut by a {type(self).__name__}"),)
 
     @abc.abstractmethod
     def moved(self, origin: Exact) -> "AbstractClipping":
@@ -152,8 +152,8 @@ class ClippingPlane(AbstractClipping):
 
     def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
         volume = scene.volume
-        corners = np.stack(np.meshgrid(*zip(*volume.domain, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
-        height = np.asarray(self._height(tuple(np.stack(volume.world_from_point(tuple(corners.T))))))
+        x, y, z = (c.ravel() for c in jnp.meshgrid(*map(jnp.asarray, zip(*volume.domain, strict=True)), indexing="ij"))
+        height = np.asarray(self._height(volume.world_from_point((x, y, z))))
         if np.all(height > 0):
             yield f"{name} cuts all of the volume away: turn its normal round, or move its point"
         elif np.all(height <= 0):

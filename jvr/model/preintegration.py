@@ -32,6 +32,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jvr.model.optical import AbstractOpticalModel, with_own
+from jvr.model.stretches import Ramp, Stretch, means_of_blocks, own_ramp, ramp, union
 from jvr.model.transfer import AbstractTransfer, Classified, LinearTransfer, LutTransfer
 from jvr.numerics import attenuated, divide_or_zero, read_run
 from jvr.types import Channels, Scalar, Triple
@@ -105,7 +106,7 @@ class PreIntegratedTable(AbstractTransfer):
         self.entries = jnp.pad(jnp.concatenate([x[:, None], table.rgb, sigma_t, *own], axis=1), ((1, 1), (0, 0)), mode="edge")
         mean, rise = lambda v: 0.5 * (v[1:] + v[:-1]), lambda v: v[1:] - v[:-1]
         of = lambda ramp, values: ramp(mean(sigma_t), rise(sigma_t), mean(values), rise(values))
-        self.blocks = _blocks(x, (of(_ramp, table.rgb), *(of(_own_ramp, q) for q in own)))
+        self.blocks = means_of_blocks(x, (of(ramp, table.rgb), *(of(own_ramp, q) for q in own)))
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         return self.table.evaluate(s)
@@ -151,8 +152,8 @@ class PreIntegratedTable(AbstractTransfer):
         channels = []
         for c in range(3):
             sigma, colour = (_profile(a, b, cut, column) for column in (3 + c % n_sigma, c))
-            whole = (_Stretch(m[1 + c % n_sigma], m[1 + n_sigma + c], m[4 + n_sigma + c]) for m in blocks)
-            pair = zip(_far_apart(cut, sigma, colour, _ramp, *whole), _nearby(cut, sigma, colour), strict=True)
+            whole = (Stretch(m[1 + c % n_sigma], m[1 + n_sigma + c], m[4 + n_sigma + c]) for m in blocks)
+            pair = zip(_far_apart(cut, sigma, colour, ramp, *whole), _nearby(cut, sigma, colour), strict=True)
             channels.append([jnp.where(cut.whole, far, near) for far, near in pair])
         rgb, sigma_t, surplus, lag = (tuple(v) for v in zip(*channels, strict=True))
         turned: Callable[[Channels], Channels] = lambda lags: tuple(jnp.where(falls, -v, v) for v in lags)
@@ -168,8 +169,8 @@ class PreIntegratedTable(AbstractTransfer):
         channels = []
         for c in range(3):
             sigma, own = (_profile(a, b, cut, column) for column in (3 + c % n_sigma, 3 + n_sigma + c))
-            whole = (_Stretch(m[1 + c % n_sigma], m[7 + n_sigma + c], m[10 + n_sigma + c]) for m in blocks)
-            _, _, *far = _far_apart(cut, sigma, own, _own_ramp, *whole)
+            whole = (Stretch(m[1 + c % n_sigma], m[7 + n_sigma + c], m[10 + n_sigma + c]) for m in blocks)
+            _, _, *far = _far_apart(cut, sigma, own, own_ramp, *whole)
             channels.append([jnp.where(cut.whole, *pair) for pair in zip(far, _own_nearby(cut, sigma, own), strict=True)])
         own, lag = (tuple(v) for v in zip(*channels, strict=True))
         return own, lag
@@ -294,36 +295,6 @@ def _profile(a: _End, b: _End, cut: _Cut, column: int) -> _Profile:
     return _Profile(at_a + 0.5 * rise, rise, at_b - 0.5 * rise_too, rise_too, 0.5 * (at_a + at_b))
 
 
-class _Stretch(NamedTuple):
-    """Means over a stretch of the scalar in one channel: extinction, extinction times colour, and `lag` as in `SegmentMeans`."""
-
-    sigma: Float[Array, "..."]
-    emission: Float[Array, "..."]
-    lag: Float[Array, "..."]
-
-
-def _ramp(sigma: Array, sigma_rise: Array, colour: Array, colour_rise: Array) -> _Stretch:
-    """A stretch along which extinction and colour, of these means, change linearly by these amounts (its integrals in closed form)."""
-    lag = colour_rise * (jnp.square(sigma) * (1 / 12) - jnp.square(sigma_rise) * (1 / 240))
-    return _Stretch(sigma, sigma * colour + sigma_rise * colour_rise * (1 / 12), lag)
-
-
-def _own_ramp(sigma: Array, sigma_rise: Array, own: Array, own_rise: Array) -> _Stretch:
-    """The same of emission of its own in the place of extinction times colour."""
-    return _Stretch(sigma, own, (own_rise * sigma - own * sigma_rise) * (1 / 12))
-
-
-def _union(fraction: Array, one: _Stretch, fraction_too: Array, other: _Stretch) -> _Stretch:
-    """One stretch and then another, averaged over a whole of which they are these fractions."""
-    sigma, sigma_too = fraction * one.sigma, fraction_too * other.sigma
-    emission, emission_too = fraction * one.emission, fraction_too * other.emission
-    # The middle of the union is farther back than that of the first by half of the other's depth, and the other way round.
-    apart = 0.5 * (emission_too * sigma - emission * sigma_too)
-    return _Stretch(
-        sigma + sigma_too, emission + emission_too, jnp.square(fraction) * one.lag + jnp.square(fraction_too) * other.lag + apart
-    )
-
-
 # Colour, extinction, surplus and lag of one channel.
 _Channel = tuple[Scalar, Scalar, Scalar, Scalar]
 
@@ -338,8 +309,8 @@ def _nearby(cut: _Cut, sigma: _Profile, colour: _Profile) -> _Channel:
     first = 1 - last
     bend, bend_too = sigma.rise * colour.rise * (1 / 12), sigma.rise_too * colour.rise_too * (1 / 12)
     surplus = first * (bend - 0.5 * colour.rise_too * sigma.first) + last * (bend_too + 0.5 * colour.rise * sigma.last)
-    lag = _ramp(sigma.first, sigma.rise, colour.first, colour.rise).lag
-    lag_too = _ramp(sigma.last, sigma.rise_too, colour.last, colour.rise_too).lag
+    lag = ramp(sigma.first, sigma.rise, colour.first, colour.rise).lag
+    lag_too = ramp(sigma.last, sigma.rise_too, colour.last, colour.rise_too).lag
     apart = 0.5 * sigma.first * sigma.last * (colour.rise + colour.rise_too) + sigma.first * bend_too - sigma.last * bend
     lag = jnp.square(first) * lag + jnp.square(last) * lag_too + 0.5 * first * last * apart
     return colour.ends, sigma.first + 0.5 * last * (sigma.rise + sigma.rise_too), surplus, lag
@@ -349,59 +320,20 @@ def _own_nearby(cut: _Cut, sigma: _Profile, own: _Profile) -> tuple[Scalar, Scal
     """The same of emission of its own: its mean, and its lag."""
     last = cut.last
     first = 1 - last
-    lag = _own_ramp(sigma.first, sigma.rise, own.first, own.rise).lag
-    lag_too = _own_ramp(sigma.last, sigma.rise_too, own.last, own.rise_too).lag
+    lag = own_ramp(sigma.first, sigma.rise, own.first, own.rise).lag
+    lag_too = own_ramp(sigma.last, sigma.rise_too, own.last, own.rise_too).lag
     apart = 0.5 * (sigma.first * (own.rise + own.rise_too) - own.first * (sigma.rise + sigma.rise_too))
     lag = jnp.square(first) * lag + jnp.square(last) * lag_too + 0.5 * first * last * apart
     return own.first + 0.5 * last * (own.rise + own.rise_too), lag
 
 
-_Ramp = Callable[[Array, Array, Array, Array], _Stretch]
-
-
-def _far_apart(cut: _Cut, sigma: _Profile, values: _Profile, ramp: _Ramp, block: _Stretch, block_too: _Stretch) -> _Channel:
+def _far_apart(cut: _Cut, sigma: _Profile, values: _Profile, ramp: Ramp, block: Stretch, block_too: Stretch) -> _Channel:
     """Whole intervals between the ends."""
     one = jnp.ones_like(cut.first)
-    lower = _union(cut.first, ramp(sigma.first, sigma.rise, values.first, values.rise), cut.block, block)
+    lower = union(cut.first, ramp(sigma.first, sigma.rise, values.first, values.rise), cut.block, block)
     last = ramp(sigma.last, sigma.rise_too, values.last, values.rise_too)
-    whole = _union(one, lower, one, _union(cut.block_too, block_too, cut.last, last))
+    whole = union(one, lower, one, union(cut.block_too, block_too, cut.last, last))
     return jnp.zeros_like(one), whole.sigma, whole.emission, whole.lag
-
-
-# A length and the means over it, of what is emitted with the extinction and of what is emitted beside it.
-_Block = tuple[Float[Array, "..."], tuple[_Stretch, ...]]
-
-
-def _blocks(x: Float[Array, "n"], of_intervals: tuple[_Stretch, ...]) -> Float[Array, "blocks means"]:
-    """Lengths and means of blocks of intervals, rows `level n + i`.
-
-    Intervals, numbered by their lower entries, are joined in pairs, these in pairs again, and so on. On level `l` pairs of halves of
-    `2^l` intervals are joined: there row `i` is from entry `i` to the middle of its pair, or from the middle to entry `i`.
-    """
-    n = x.shape[0]
-    levels = (n - 1).bit_length()
-    intervals = ((x[1:] - x[:-1])[:, None], of_intervals)
-    to_end: _Block = jax.tree.map(lambda v: jnp.pad(v, ((0, 2**levels - n + 1), (0, 0))), intervals)
-    i = jnp.arange(2**levels)
-
-    def join(halves: tuple[_Block, _Block], level: Int[Array, ""]) -> tuple[tuple[_Block, _Block], Float[Array, "rows means"]]:
-        # From entry `i` to the end of its half, and from the beginning of its half to entry `i`.
-        to_end, from_start = halves
-        is_second = ((i >> level) & 1)[:, None] == 1
-        choose = lambda second, first: jax.tree.map(lambda a, b: jnp.where(is_second, a, b), second, first)
-        other_half = jax.tree.map(lambda v: v[((i >> level) ^ 1) << level], to_end)
-        length, (means, *own) = choose(from_start, to_end)
-        joined = choose(to_end, _joined(to_end, other_half)), choose(_joined(other_half, from_start), from_start)
-        return joined, jnp.concatenate([length, *means, *(x for one in own for x in (one.emission, one.lag))], axis=1)
-
-    _, rows = jax.lax.scan(join, (to_end, jax.tree.map(jnp.zeros_like, to_end)), jnp.arange(levels))
-    return rows[:, :n].reshape(levels * n, -1)
-
-
-def _joined(one: _Block, other: _Block) -> _Block:
-    length = one[0] + other[0]
-    fractions = divide_or_zero(one[0], length), divide_or_zero(other[0], length)
-    return length, tuple(_union(fractions[0], a, fractions[1], b) for a, b in zip(one[1], other[1], strict=True))
 
 
 def _tilt(depth: Scalar) -> Scalar:

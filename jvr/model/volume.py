@@ -292,10 +292,12 @@ class Volume(AbstractPart):
         """Whether no voxel that makes the value at one grid position is missing; a volume without gaps has no use for it."""
         assert self.gaps is not None
         gaps, runs = self.gaps.reshape(-1), self.interpolation.stencil(self.shape, p)
-        # Of a cell its first voxel says what all of them are.
-        each = [run.start + i for run in runs for i in range(len(run.weights))] if self.interpolation.reach else [runs[0].start]
-        missing = [read_at(gaps, start) & self.interpolation.gap != 0 for start in each]
-        return ~functools.reduce(jnp.logical_or, missing)
+        is_missing = lambda index: read_at(gaps, index) & self.interpolation.gap != 0
+        if not self.interpolation.reach:
+            # Of a cell its first voxel says what all of them are.
+            return ~is_missing(runs[0].start)
+        each = [is_missing(run.start + i) & (w != 0) for run in runs for i, w in enumerate(run.weights)]
+        return ~functools.reduce(jnp.logical_or, each)
 
     def grid_from_world(self, x: Triple, *, direction: bool = False) -> Triple:
         """Grid position of a world position, or with `direction=True` grid displacement of a world displacement."""

@@ -44,6 +44,7 @@ def test_values_are_those_of_scipy(shape, x64):
     np.testing.assert_allclose(sampled(through, whole), values[tuple(whole.astype(int).T)], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_spline(x64):
     """First and second, against those of SciPy's B-splines with mirrored coefficients; no kink from one cell to the next."""
     shape = (6, 5, 7)
@@ -64,30 +65,33 @@ def test_derivatives_are_those_of_the_spline(x64):
     np.testing.assert_allclose(before, after, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_converges_with_order_four(x64):
     """On a smooth field whose mirror images continue it smoothly."""
     field = lambda x: np.cos(np.pi * x[..., 0]) * np.cos(2 * np.pi * x[..., 1]) + np.cos(3 * np.pi * x[..., 2])
-    where, errors, sizes = np.random.default_rng(1).random((500, 3)), [], (9, 17, 33)
+    where, errors, sizes = np.random.default_rng(1).random((500, 3)), [], (17, 33, 65)
     for n in sizes:
         x = np.stack(np.meshgrid(*[np.linspace(0, 1, n)] * 3, indexing="ij"), -1)
         errors.append(np.sqrt(np.mean((sampled(cubic(field(x)).prefiltered(), where * (n - 1)) - field(where)) ** 2)))
     found = -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
-    assert abs(found - 4) < 0.3, errors
+    assert abs(found - 4) < 0.3, (found, errors)
 
 
+@pytest.mark.slow
 def test_skipping_leaves_nothing_out(x64):
     """Single bright voxels at the borders of bricks: the spline carries them into bricks that hold none of them."""
-    values = np.zeros((13, 12, 14))
-    values[4, 4, 4] = values[5, 9, 8] = values[0, 11, 12] = values[11, 3, 3] = 1.0
+    values = np.zeros((29, 12, 14))
+    values[4, 4, 4] = values[5, 9, 8] = values[0, 11, 12] = 1.0
     transfer = jvr.LinearTransfer([0.0, 1e-3, 1.0], np.ones((3, 3)), [0.0, 5.0, 5.0])
     volume = jvr.Volume(values, OBLIQUE, interpolation=jvr.Tricubic()).bricked()
-    scene, camera = jvr.Scene(volume, transfer), perspective(volume, 12, 12)
+    scene, camera = jvr.Scene(volume, transfer), perspective(volume, 16, 16)
     images = [render(scene, camera, jvr.Settings(0.3, termination=0, skipping=skips)) for skips in (True, False)]
     np.testing.assert_allclose(images[0].rgb, images[1].rgb, rtol=1e-10, atol=1e-14)
     assert images[0].stats.steps.sum() < 0.8 * images[1].stats.steps.sum()
-    assert np.count_nonzero(images[1].alpha > 0.1) > 10
+    assert np.count_nonzero(images[1].alpha > 0.1) > 8
 
 
+@pytest.mark.slow
 def test_every_derivative_of_a_picture(x64):
     """In voxels and in the transfer function by replay, against central differences."""
     values, transfer = jnp.asarray(voxels((5, 4, 3))), linear_transfer()
@@ -119,7 +123,7 @@ def test_normals_of_a_ball_have_no_facets(x64):
     for interpolation in (jvr.Trilinear(), jvr.Tricubic()):
         volume = jvr.Volume(values, interpolation=interpolation)
         found = np.asarray(jax.jit(jax.vmap(jax.grad(lambda x, volume=volume: volume.sample(tuple(x)))))(p))
-        found /= np.linalg.norm(found, axis=-1, keepdims=True)
+        found = found / np.linalg.norm(found, axis=-1, keepdims=True)
         errors[type(interpolation).__name__] = np.rad2deg(np.max(np.linalg.norm(found - truth, axis=-1)))
     assert errors["Trilinear"] > 4
     assert errors["Tricubic"] < 0.6
@@ -129,14 +133,14 @@ def test_what_is_made_of_missing_voxels_is_missing():
     values = voxels((7, 6, 8)).astype(np.float32)
     values[3, 3, 3] = np.nan
     volume = cubic(values)
-    p = jnp.asarray(everywhere(volume.shape, 400), jnp.float32)
+    p = jnp.asarray(everywhere(volume.shape, 400)[100:], jnp.float32)
     known = np.asarray(jax.jit(jax.vmap(lambda x: volume.is_known(tuple(x))))(p))
     low = np.clip(np.floor(np.asarray(p)), 0, np.array(volume.shape) - 2)
     np.testing.assert_array_equal(known, ~np.all((low >= 1) & (low <= 4), axis=1))
 
 
 def test_refuses_what_it_cannot_do():
-    with pytest.raises(ValueError, match="interpolation=jvr.Tricubic"):
+    with pytest.raises(ValueError, match="set Volume"):
         jvr.Volume(voxels()).prefiltered()
     gappy = voxels()
     gappy[0, 0, 0] = np.nan

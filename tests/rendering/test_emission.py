@@ -11,6 +11,8 @@ from scenes import OBLIQUE, affine, perspective, render, voxels
 
 import jvr
 from jvr.model.preintegration import PreIntegratedTable
+from jvr.model.transfer import Classified
+from jvr.rendering.advise import effects_of, remarks_on
 
 LENGTH = 8.0
 COLOUR, GLOW = np.array([0.9, 0.5, 0.2]), np.array([0.3, 0.1, 0.7])
@@ -44,7 +46,7 @@ def seen(image, rgb, alpha, tolerance=1e-12):
     np.testing.assert_allclose(image.alpha, np.broadcast_to(alpha, image.alpha.shape), rtol=tolerance)
 
 
-@pytest.mark.parametrize("quadrature", [jvr.Midpoint(), jvr.PreIntegrated()])
+@pytest.mark.parametrize("quadrature", [jvr.Midpoint(), pytest.param(jvr.PreIntegrated(), marks=pytest.mark.slow)])
 def test_homogeneous_slab_with_and_without_extinction(x64, quadrature):
     """`q (1 - exp(-sigma d)) / sigma`, and `q d` where nothing is absorbed (notes, eq. 1.3 and 1.7)."""
     settings = dataclasses.replace(SETTINGS, quadrature=quadrature)
@@ -59,6 +61,7 @@ def test_homogeneous_slab_with_and_without_extinction(x64, quadrature):
         )
 
 
+@pytest.mark.slow
 def test_under_each_optical_model_and_with_coloured_extinction(x64):
     sigma = np.array([0.0, 0.3, 0.7])
     transfer = jvr.LutTransfer([COLOUR] * 2, [sigma] * 2, [0.0, 1.0], [GLOW] * 2)
@@ -116,6 +119,7 @@ def own(table, s0, s1, dt, parts=1):
     return np.stack(emitted, -1), np.asarray(dtau)
 
 
+@pytest.mark.slow
 def test_pre_integration_against_quadrature(x64):
     """Ramps of the table in both directions, in one interval, in neighbouring ones and across several. Without extinction it is exact; else
     the rule has order 4 in its parts."""
@@ -136,6 +140,7 @@ def test_pre_integration_against_quadrature(x64):
     np.testing.assert_allclose(own(clear, s0, s1, dt)[0], exact, rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_pre_integrated_derivatives_against_differences(x64):
     s0, s1, dt = map(jnp.asarray, map(np.array, zip(*segments(), strict=True)))
     weights = jnp.sin(jnp.arange(1.0, 3 * s0.size + 1)).reshape(3, -1)
@@ -164,21 +169,21 @@ def test_pre_integrated_derivatives_against_differences(x64):
             )
 
 
-def picture(p, settings):
-    volume = jvr.Volume(p["voxels"], OBLIQUE)
-    transfer = jvr.LinearTransfer(FLAME["positions"], p["rgb"], p["sigma_t"], p["emission"])
-    return jvr.render(
-        jvr.Scene(volume, transfer, background=BACKGROUND), perspective(jvr.Volume(voxels((3, 4, 5)), OBLIQUE), 4, 3), settings
-    ).rgb
+def picture(p, settings, camera):
+    transfer = jvr.LinearTransfer(jnp.asarray(FLAME["positions"]), p["rgb"], p["sigma_t"], p["emission"])
+    return jvr.render(jvr.Scene(jvr.Volume(p["voxels"], OBLIQUE), transfer, background=BACKGROUND), camera, settings).rgb
 
 
+@pytest.mark.slow
 def test_every_derivative_against_differences(x64):
     """Reverse mode by replay, forward mode, rows in both modes, under `vmap`: against central differences, at entries without extinction
     and without emission too, where differences are one-sided."""
-    p = {name: jnp.asarray(FLAME[name]) for name in ("rgb", "sigma_t", "emission")} | {"voxels": jnp.asarray(voxels((3, 4, 5)))}
+    p = {name: jnp.asarray(FLAME[name]) for name in ("rgb", "sigma_t", "emission")} | {
+        "voxels": jnp.asarray(0.7 * voxels((3, 4, 5)))
+    }
     entries = {name: p[name] for name in ("rgb", "sigma_t", "emission")}
-    weights = jnp.sin(jnp.arange(1.0, 37.0)).reshape(3, 4, 3)
-    loss = lambda adjoint, q: jnp.sum(weights * picture(p | q, jvr.Settings(0.7, termination=0, adjoint=adjoint)) ** 2)
+    weights, camera = jnp.sin(jnp.arange(1.0, 37.0)).reshape(3, 4, 3), perspective(jvr.Volume(p["voxels"], OBLIQUE), 4, 3)
+    loss = lambda adjoint, q: jnp.sum(weights * picture(p | q, jvr.Settings(0.7, termination=0, adjoint=adjoint), camera) ** 2)
     reverse = jax.jit(jax.grad(lambda q: loss(jvr.Replay(), q)))(p)
     value = jax.jit(lambda q: loss(jvr.Forward(), q))
     for name, i in (("emission", 0), ("emission", 4), ("sigma_t", 0), ("sigma_t", 2), ("rgb", 7), ("voxels", 17), ("voxels", 40)):
@@ -202,15 +207,15 @@ def test_every_derivative_against_differences(x64):
 
 
 def test_nothing_is_finite(x64):
-    """No extinction and no length: values and derivatives."""
-    one = lambda q, sigma, dt: jnp.stack(
-        jvr.EmissionAbsorption().evaluate_segment(
-            jvr.LinearTransfer([0.0, 1.0], [COLOUR] * 2, sigma * jnp.ones(2), q * jnp.ones((2, 3))).evaluate(jnp.array(0.5)), dt
-        )[0]
-    )
+    """No extinction and no length: values and derivatives of a segment."""
+
+    def one(q, sigma, dt):
+        entry = Classified(tuple(map(jnp.asarray, COLOUR)), (sigma,), (q,) * 3)
+        return jnp.stack(jvr.EmissionAbsorption().evaluate_segment(entry, dt)[0])
+
+    both = jax.jit(lambda *x: (one(*x), jax.jacfwd(one, argnums=(0, 1, 2))(*x)))
     for q, sigma, dt in ((1.0, 0.0, 0.0), (1.0, 0.0, 2.0), (0.0, 0.0, 0.0), (1.0, 1e-30, 1.0), (1.0, 1e30, 1.0)):
-        found = one(*map(jnp.asarray, (q, sigma, dt)))
-        of_q, of_sigma, of_dt = (np.asarray(x) for x in jax.jacfwd(one, argnums=(0, 1, 2))(*map(jnp.asarray, (q, sigma, dt))))
+        found, (of_q, of_sigma, of_dt) = both(*map(jnp.asarray, (q, sigma, dt)))
         assert np.isfinite([found, of_q, of_sigma, of_dt]).all()
         if sigma == 0:
             np.testing.assert_allclose(found, q * dt * np.ones(3))
@@ -219,50 +224,53 @@ def test_nothing_is_finite(x64):
             np.testing.assert_allclose(of_sigma, COLOUR * dt - q * dt**2 / 2)
 
 
+GLOWING = np.array(FLAME["emission"])
 TRANSFERS = {
-    "linear": lambda: jvr.LinearTransfer(**FLAME),
-    "table": lambda: jvr.LutTransfer(FLAME["rgb"], FLAME["sigma_t"], [0.1, 0.85], FLAME["emission"]),
-    "Gaussians": lambda: jvr.GaussianTransfer([0.2, 0.7], [0.03, 0.1], [0.0, 0.5], FLAME["rgb"][:2], FLAME["emission"][1:3]),
-    "2-D": lambda: jvr.GradientTransfer(
-        np.repeat(np.array(FLAME["rgb"])[:, None], 2, 1), np.outer(FLAME["sigma_t"], [0, 1]), [0.1, 0.85], [0.0, 0.3],
-        np.array(FLAME["emission"])[:, None] * np.array([1.0, 0.5])[:, None],
+    "linear": jvr.LinearTransfer(**FLAME),
+    "table": jvr.LutTransfer(FLAME["rgb"], FLAME["sigma_t"], [0.1, 0.85], GLOWING),
+    "Gaussians": jvr.GaussianTransfer([0.35, 0.7], [0.02, 0.01], [0.0, 0.5], FLAME["rgb"][:2], GLOWING[1:3]),
+    "2-D": jvr.GradientTransfer(
+        np.repeat(np.array(FLAME["rgb"])[:, None], 2, 1),
+        np.outer(FLAME["sigma_t"], [0, 1]),
+        [0.1, 0.85],
+        [0.0, 0.4],
+        GLOWING[:, None] * np.array([0.0, 2.0])[:, None],
     ),
-    "gradient opacity": lambda: jvr.GradientOpacity(jvr.LinearTransfer(**FLAME), 0.0, 0.2),
-}  # fmt: skip
+    "gradient opacity": jvr.GradientOpacity(jvr.LinearTransfer(**FLAME), 0.0, 0.2),
+}
 
 
 @pytest.mark.parametrize("kind", TRANSFERS)
-def test_what_glows_is_not_skipped(kind):
-    """Emission is the sum of what the transfer function alone says of samples (the scalar is linear: each is known), whether its bricks
-    have extinction or not, and with skipping as without."""
-    profile = np.linspace(0.0, 0.5, 17)
+def test_each_transfer_function_knows_what_glows(kind):
+    """At its entry the second one glows as it was said, here at half the length of the gradient where that counts, and is visible without
+    extinction; where nothing glows nor absorbs nothing is, and glow below a bound is not."""
+    transfer, half = TRANSFERS[kind], kind == "gradient opacity"
+    found = transfer.evaluate(jnp.asarray(0.35), jnp.asarray(0.1 if half else 0.2))
+    np.testing.assert_allclose(found.emission, GLOWING[1] * (0.5 if half else 1), rtol=1e-5)
+    assert found.sigma_t[0] == 0
+    visible = lambda low, high, least=0.0: bool(transfer.is_visible(jnp.asarray(low), jnp.asarray(high), least))
+    assert visible(0.34, 0.36)
+    assert not visible(0.0, 0.05)
+    assert not visible(0.34, 0.36, 2.0)
+
+
+def test_what_glows_is_not_skipped():
+    """Along a ramp of the scalar the picture is the sum of what the transfer function says of samples, with skipping as without."""
+    profile = np.linspace(-0.5, 0.5, 17)
     volume = jvr.Volume(np.broadcast_to(profile[:, None, None], (17, 5, 5)))
     camera = jvr.OrthographicCamera.look_at([30, 2, 2], [0, 2, 2], [0, 0, 1], 0.6, 1, 1)
-    transfer = TRANSFERS[kind]()
-    scene, settings = jvr.Scene(volume, transfer, optical=jvr.EmissionOnly()), jvr.Settings(0.5, termination=0)
-    image = render(scene, camera, settings)
-    s = (np.arange(32) + 0.5) / 32 * 0.5
-    slope = jnp.asarray(0.5 / 16)
-    found = jax.vmap(lambda s: transfer.evaluate(s, slope))(jnp.asarray(s))
-    expected = [
-        0.5 * np.sum(np.asarray(q) + np.asarray(c) * np.asarray(found.sigma_t[0]))
-        for q, c in zip(found.emission, found.rgb, strict=True)
-    ]
-    assert min(expected) > 0.1
-    np.testing.assert_allclose(image.rgb[0, 0], expected, rtol=1e-5)
-    assert image.stats.steps[0, 0] <= 32
-    dark = eqx.tree_at(
-        lambda t: [
-            x for x in (getattr(t, "emission", None), getattr(getattr(t, "transfer", None), "emission", None)) if x is not None
-        ],
-        transfer,
-        replace_fn=jnp.zeros_like,
-    )
-    without = render(dataclasses.replace(scene, transfer=dark), camera, settings)
-    assert without.stats.steps[0, 0] < image.stats.steps[0, 0]
+    transfer = TRANSFERS["linear"]
+    image = render(jvr.Scene(volume, transfer, optical=jvr.EmissionOnly()), camera, SETTINGS)
+    s = (np.arange(32) + 0.5) / 32 - 0.5
+    of = lambda table: np.stack([np.interp(s, FLAME["positions"], column) for column in np.array(table).T], 1)
+    extinction = np.interp(s, FLAME["positions"], FLAME["sigma_t"])[:, None]
+    np.testing.assert_allclose(image.rgb[0, 0], 0.5 * np.sum(of(GLOWING) + extinction * of(FLAME["rgb"]), axis=0), rtol=1e-5)
+    # Below the first entry that glows there is nothing; between that and the first that absorbs there is.
+    skipped = np.sum(s < 0.1)
+    assert 32 - skipped <= image.stats.steps[0, 0] < 32
 
 
-@pytest.mark.parametrize("quadrature", [jvr.Midpoint(), jvr.PreIntegrated()])
+@pytest.mark.parametrize("quadrature", [jvr.Midpoint(), pytest.param(jvr.PreIntegrated(), marks=pytest.mark.slow)])
 def test_light_and_shadows_leave_it_alone(quadrature):
     """Lit black smoke shows what the unlit one shows: its emission, whatever light falls on it."""
     settings = jvr.Settings(0.5, termination=0, quadrature=quadrature)
@@ -277,6 +285,7 @@ def test_light_and_shadows_leave_it_alone(quadrature):
     assert image.rgb.max() > 0.3
 
 
+@pytest.mark.slow
 def test_is_fitted_with_standard_errors():
     """From noisy pictures; errors are of the size of what they foretell, and rows agree with differences in a step."""
     volume = jvr.Volume(voxels((6, 6, 6)))
@@ -296,17 +305,16 @@ def test_is_fitted_with_standard_errors():
 
 
 def test_says_what_does_not_show():
-    volume = jvr.Volume(voxels((4, 4, 4)))
-    scene = jvr.Scene(volume, jvr.LinearTransfer(**FLAME), optical=jvr.AbsorptionOnly())
-    camera = perspective(volume, 2, 2)
-    assert any("emission does not show" in remark for remark in jvr.advise(scene, camera, repeats=1).remarks)
-    dark = dataclasses.replace(
-        scene, transfer=jvr.LinearTransfer(**FLAME | {"emission": np.zeros((4, 3))}), optical=jvr.EmissionAbsorption()
-    )
-    advice = jvr.advise(dark, camera, repeats=1)
-    assert any("zero everywhere" in remark for remark in advice.remarks)
-    assert [c.effect for c in advice.contributions if c.rmse == 0] == ["emission of its own"]
-    assert "emission of its own" in str(jvr.plan(scene, jvr.Settings()))
+    scene = jvr.Scene(jvr.Volume(voxels((4, 4, 4))), jvr.LinearTransfer(**FLAME), optical=jvr.AbsorptionOnly())
+    assert any("emission does not show" in remark for remark in remarks_on(scene, None))
+    dark = dataclasses.replace(scene, transfer=jvr.LinearTransfer(**FLAME | {"emission": np.zeros((4, 3))}))
+    dark = dataclasses.replace(dark, optical=jvr.EmissionAbsorption())
+    assert any("zero everywhere" in remark for remark in remarks_on(dark, None))
+    assert not list(remarks_on(jvr.Scene(scene.volume, scene.transfer), None))
+    (effect,) = effects_of(scene)
+    assert effect.title == "emission of its own"
+    assert effect.change(scene, SETTINGS)[0].transfer.emission is None
+    assert "emission of its own" in str(jvr.plan(scene, SETTINGS))
 
 
 def test_refuses_what_is_no_emission():
