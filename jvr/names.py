@@ -71,6 +71,7 @@ NAMES = {
     "jvr.model.clipping": ("ClippingBox", "ClippingPlane"),
     "jvr.model.dipole": ("Dipole",),
     "jvr.model.environment": ("EnvironmentLight",),
+    "jvr.model.environment_map": ("EnvironmentMap",),
     "jvr.model.gradient_transfer": ("GradientOpacity", "GradientTransfer"),
     "jvr.model.interpolation": ("Nearest", "Tricubic", "Trilinear"),
     "jvr.model.light": ("AmbientLight", "DirectionalLight", "HeadLight", "PointLight", "SpotLight", "disc_light", "sphere_light"),

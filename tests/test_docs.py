@@ -31,6 +31,7 @@ from jvr.march.quadrature import AbstractQuadrature
 from jvr.model.camera import AbstractCamera
 from jvr.model.effects import AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
+from jvr.model.environment_map import EnvironmentMap
 from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
@@ -171,6 +172,7 @@ FAMILIES = {
     "[scattering.phase]": AbstractPhase,
     "[normals]": AbstractNormals,
     "[material]": AbstractBRDF,
+    "[background]": EnvironmentMap,
     "[environment]": EnvironmentLight,
     "[camera]": AbstractCamera,
     "[settings.quadrature]": AbstractQuadrature,

@@ -127,7 +127,8 @@ def march_unknowns(problem: Problem) -> int:
 def adjoint_of(problem: Problem) -> AbstractAdjoint:
     """How the whole residual vector is differentiated."""
     # Rows do not know light that changes on its way: that of an environment, through a radiance transfer.
-    around = lambda m: () if m.scene.radiance_transfer is None else (m.scene.environment_lights, m.scene.radiance_transfer)
+    of_scene = lambda s: (s.environment, s.environment_lights, s.radiance_transfer)
+    around = lambda m: () if m.scene.radiance_transfer is None else of_scene(m.scene)
     known = _has_rows(problem) and not problem.unknowns.among(problem.model, around) and problem.model.views is None
     return Rows() if known else Forward()
 

@@ -20,6 +20,7 @@ from jvr.model.effects import (
     AbstractShadows,
 )
 from jvr.model.environment import EnvironmentLight
+from jvr.model.environment_map import EnvironmentMap
 from jvr.model.interpolation import AbstractInterpolation
 from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
@@ -91,6 +92,7 @@ KINDS: dict[type, dict[str, str]] = {
         "constant": "EnvironmentLight.constant",
         "disc": "EnvironmentLight.disc",
     },
+    EnvironmentMap: {"image": "EnvironmentMap.from_image", "gradient": "EnvironmentMap.gradient"},
     AbstractOpticalModel: {
         "emission-absorption": "EmissionAbsorption",
         "emission-only": "EmissionOnly",

@@ -10,6 +10,7 @@ import equinox as eqx
 from jvr.model.clipping import AbstractClipping, ClippingBox
 from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer, AbstractScattering, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
+from jvr.model.environment_map import EnvironmentMap
 from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
@@ -28,7 +29,7 @@ class Scene(AbstractPart):
 
     - `volume`: `jvr.Volume`.
     - `transfer`: a transfer function, `jvr.LinearTransfer`, `jvr.LutTransfer` or `jvr.GaussianTransfer`.
-    - `background`: `(3,)` linear RGB that shows through what is transparent, or `None`.
+    - `background`: what shows through what is transparent: `(3,)` linear RGB, `jvr.EnvironmentMap`, or `None`.
     - `optical`: `jvr.EmissionAbsorption()` (default), `jvr.EmissionOnly()` or `jvr.AbsorptionOnly()`.
     - `clipping`: what is left of the volume: `jvr.ClippingBox`, `jvr.ClippingPlane`, several of them in a row, or `None`: all of it.
     - `lights`: any number of `jvr.DirectionalLight`, `jvr.PointLight`, `jvr.SpotLight`, `jvr.HeadLight`, `jvr.AmbientLight` and
@@ -37,7 +38,8 @@ class Scene(AbstractPart):
     - `shadows`: how much of each light reaches a point: `jvr.ShadowRays`, `jvr.ShadowVolume`, `jvr.ShadowMap`, `jvr.OpacityShadowMap`,
       `jvr.DeepShadowMap`, or `None`: all of it.
     - `scattering`: what the medium makes of light: `jvr.SingleScattering` or `None`.
-    - `environment`: light from far away in all directions: `jvr.EnvironmentLight` or `None`; adds to those among `lights`.
+    - `environment`: light from far away in all directions: `jvr.EnvironmentLight`, `jvr.EnvironmentMap` or `None`; adds to those among
+      `lights`.
     - `material`: what a point makes of the environment's light: a BRDF such as `jvr.MicrofacetBRDF(...)`, `jvr.HarmonicMaterial`,
       `jvr.MaterialByValue`, or `None`.
     - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
@@ -50,7 +52,7 @@ class Scene(AbstractPart):
 
     volume: Volume = parameter(doc="a jvr.Volume, as jvr.read_volume gives it")
     transfer: AbstractTransfer = parameter(doc="one of jvr's")
-    background: Vector | None = parameter(COLOUR, doc="red, green, blue, linear")
+    background: Vector | EnvironmentMap | None = parameter(COLOUR, doc="red, green, blue, linear, or a jvr.EnvironmentMap")
     optical: AbstractOpticalModel = parameter(doc="one of jvr's")
     # The first class is that of a file that names none.
     clipping: ClippingBox | AbstractClipping | tuple[ClippingBox | AbstractClipping, ...] | None = parameter(
@@ -61,7 +63,7 @@ class Scene(AbstractPart):
     shadows: AbstractShadows | None = parameter(doc="one of jvr's")
     scattering: AbstractScattering | None = parameter(doc="one of jvr's")
     normals: AbstractNormals = parameter(doc="one of jvr's")
-    environment: EnvironmentLight | None = parameter(doc="a jvr.EnvironmentLight")
+    environment: EnvironmentLight | EnvironmentMap | None = parameter(doc="a jvr.EnvironmentLight or a jvr.EnvironmentMap")
     material: AbstractMaterial | None = parameter(doc="one of jvr's")
     radiance_transfer: AbstractRadianceTransfer | None = parameter(doc="a jvr.RadianceTransfer")
 
@@ -70,7 +72,7 @@ class Scene(AbstractPart):
         volume: Volume,
         transfer: AbstractTransfer,
         *,
-        background: ArrayLike | None = None,
+        background: ArrayLike | EnvironmentMap | None = None,
         optical: AbstractOpticalModel = EmissionAbsorption(),
         clipping: AbstractClipping | Sequence[AbstractClipping] | None = None,
         lights: Sequence[AbstractLight] = (),
@@ -78,7 +80,7 @@ class Scene(AbstractPart):
         shadows: AbstractShadows | None = None,
         scattering: AbstractScattering | None = None,
         normals: AbstractNormals = AnalyticGradient(),
-        environment: EnvironmentLight | None = None,
+        environment: EnvironmentLight | EnvironmentMap | None = None,
         material: AbstractMaterial | None = None,
         radiance_transfer: AbstractRadianceTransfer | None = None,
     ):
@@ -110,11 +112,16 @@ class Scene(AbstractPart):
 
     @property
     def ends_rays(self) -> bool:
-        return any(part.ends_rays for _, part in parts_of(self))
+        return isinstance(self.background, EnvironmentMap) or any(part.ends_rays for _, part in parts_of(self))
+
+    @property
+    def background_colour(self) -> Vector | None:
+        """The background where it is one colour for all rays, else `None`."""
+        return None if isinstance(self.background, EnvironmentMap) else self.background
 
     @property
     def environment_lights(self) -> tuple[EnvironmentLight, ...]:
-        """Its environment and those among its lights."""
+        """Its environment, as harmonics, and those among its lights."""
         return _environments(self.lights, self.environment)
 
     @property
@@ -132,7 +139,7 @@ class Scene(AbstractPart):
         return any(part.needs_gradient for _, part in parts_of(self))
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        return () if self.background is None else (PlanEntry("background", True, "shows through"),)
+        return () if self.background_colour is None else (PlanEntry("background", True, "shows through"),)
 
     def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
         if not self.lights and self.shows_lights:
@@ -167,7 +174,11 @@ def _casters(lights: Sequence[AbstractLight]) -> tuple[AbstractDeltaLight | None
     return tuple(light if isinstance(light, AbstractDeltaLight) and light.casts_shadows else None for light in lights)
 
 
-def _environments(lights: Sequence[AbstractLight], environment: EnvironmentLight | None) -> tuple[EnvironmentLight, ...]:
+def _environments(
+    lights: Sequence[AbstractLight], environment: EnvironmentLight | EnvironmentMap | None
+) -> tuple[EnvironmentLight, ...]:
+    if isinstance(environment, EnvironmentMap):
+        environment = environment.to_harmonics(environment.order)
     return tuple(light for light in (environment, *lights) if isinstance(light, EnvironmentLight))
 
 

@@ -11,6 +11,7 @@ from jvr.march.march import Marched
 from jvr.march.steps import End, Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.clipping import interval_inside, moved_clipping
+from jvr.model.environment_map import EnvironmentMap
 from jvr.model.scene import Scene
 from jvr.numerics import larger, one_minus_exp
 from jvr.types import Scalar, Triple
@@ -64,8 +65,10 @@ def enter(
     """World rays inside the volume (and its clipping), and the distance from the eye, which is `behind` their origin by so much, to
     where they enter.
 
-    A ray with non-finite numbers gets the length NaN, which `composite` turns into a NaN pixel.
+    Where what is behind differs from ray to ray, they know what they end at. A ray with non-finite numbers gets the length NaN, which
+    `composite` turns into a NaN pixel.
     """
+    end = _end(scene, direction)
     start = scene.volume.grid_from_world(origin)
     along = scene.volume.grid_from_world(direction, direction=True)
     t_in, t_out = interval_inside(scene.volume, scene.clipping, (origin, direction), (start, along))
@@ -77,7 +80,16 @@ def enter(
     poison = jnp.where(jnp.isfinite(sum(start) + sum(along)), 0.0, jnp.nan)
     start, along = keep(start), keep(along)
     entry = tuple(s + t_in * d for s, d in zip(start, along, strict=True))
-    return Rays(entry, along, t_out - t_in + poison), jnp.where(hit, behind + t_in, 0.0)
+    return Rays(entry, along, t_out - t_in + poison, end), jnp.where(hit, behind + t_in, 0.0)
+
+
+def _end(scene: Scene, direction: Triple) -> End | None:
+    """What rays end at, `None` where that is a background of one colour or nothing at all."""
+    if not isinstance(scene.background, EnvironmentMap):
+        return None
+    far = scene.background.radiance(jnp.stack(direction, axis=1))
+    nothing = jnp.zeros_like(direction[0])
+    return End((far[:, 0], far[:, 1], far[:, 2]), nothing, nothing)
 
 
 def camera_rays(scene: Scene, camera: AbstractCamera, pixels: Int[Array, "rays"]) -> tuple[Rays, Float[Array, "rays"]]:
@@ -107,8 +119,7 @@ def seen_end(gathered: Marched, end: End) -> Float[Array, "rays"]:
 
 def _behind(scene: Scene, rays: Rays) -> Any:
     """Radiance behind the medium in three channels, or `None` where there is none."""
-    if rays.end is None:
-        return scene.background
-    if scene.background is None:
-        return rays.end.rgb
-    return tuple(c + (1 - rays.end.opaque) * b for c, b in zip(rays.end.rgb, scene.background, strict=True))
+    colour, end = scene.background_colour, rays.end
+    if end is None:
+        return colour
+    return end.rgb if colour is None else tuple(c + (1 - end.opaque) * b for c, b in zip(end.rgb, colour, strict=True))

@@ -154,6 +154,7 @@ SCENES = {
     "packed": lambda: scene(jvr.Volume(voxels(SHAPE), missing=3.0).packed().bricked()),
     "natural": lambda: natural(radiance_transfer=jvr.RadianceTransfer(exact=True)),
     "negative": lambda: natural(environment=jvr.EnvironmentLight(-0.0 * np.ones((4, 3)), clamped=False)),
+    "seen": lambda: natural(environment=(sky := jvr.EnvironmentMap(voxels((4, 8, 3)), order=2)), background=sky),
     "materials": materials,
     "projected": projected,
     "frozen": frozen,

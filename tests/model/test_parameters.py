@@ -198,6 +198,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "DoubleHenyeyGreenstein": {"g1": 0.3, "g2": -0.3, "weight": 0.5},
     "Draine": {"g": 0.3, "alpha": 1.0},
     "EnvironmentLight": {"coefficients": [[1.0, 1.0, 1.0]]},
+    "EnvironmentMap": {"pixels": [[[1.0, 0.5, 0.2]] * 2]},
     "ForwardDifferences": {},
     "GaussianTransfer": {"center": [0.0, 1.0], "width": [0.1, 0.2], "height": [1.0, 2.0], "rgb": RGB},
     "GradientOpacity": {"transfer": jvr.LinearTransfer([0.0, 1.0], RGB, [0.0, 1.0]), "low": 0.1, "high": 0.2},

@@ -7,10 +7,10 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
-from jvr.io.config.schema.environment import Environments, Material, RadianceTransfer
+from jvr.io.config.schema.environment import Background, Environments, Material, RadianceTransfer
 from jvr.io.config.schema.light import Lights, Normals, OneOrMore, Scattering, Shading, Shadows, casts_shadows
 from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, only, part
-from jvr.io.config.schema.table import Colour, Extinction, Position, Range, Scalar, Table, one_or_more
+from jvr.io.config.schema.table import Extinction, Position, Range, Scalar, Table, one_or_more
 from jvr.io.config.schema.transfer import Transfer
 from jvr.io.kinds import maker_of
 from jvr.model.camera import AbstractCamera
@@ -248,7 +248,7 @@ class ConfigTable(Table):
     volume: VolumeTable
     transfer: Transfer | None = None
     truth: Transfer | None = None
-    background: Colour | None = None
+    background: Background | None = None
     optical: Annotated[Any, part(AbstractOpticalModel)] | None = None
     clipping: Clippings | None = None
     lights: Lights = Field(default=[])
