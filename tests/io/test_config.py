@@ -89,11 +89,11 @@ def refusal(text, *sets):
         ("[settings.sampling]\nkind = 'slices'\ntolerance = 0", "settings.sampling.tolerance", "must be positive"),
         ("[settings.sampling]\nkind = 'slices'\noracle = 'finst'", "settings.sampling.oracle", "did you mean 'finest'?"),
         ("[settings.sampling]\nkind = 'refinement'\ntile = 6", "settings.sampling", "a power of two from 2 to 64"),
-        ("[clipping]\nkind = 'ball'\nlower = [0, 0, 0]\nupper = [1, 1, 1]", "clipping.kind", "did you mean"),
+        ("[clipping]\nkind = 'ball'\nlower = [0, 0, 0]\nupper = [1, 1, 1]", "clipping.kind", "known: box, plane"),
         (
             "[clipping]\nkind = 'plane'\npoint = [0, 0, 0]\nnormal = [0, 0, 0]",
             "clipping.normal",
-            "a direction of any length but zero",
+            "must have a direction",
         ),
         (
             "[[clipping]]\nlower = [0, 0, 0]\nupper = [1, 1, 1]\n[[clipping]]\nnormal = [0, 0, 1]",
