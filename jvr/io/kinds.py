@@ -21,6 +21,7 @@ from jvr.model.effects import (
 )
 from jvr.model.environment import EnvironmentLight
 from jvr.model.environment_map import EnvironmentMap
+from jvr.model.geometry import AbstractGeometry
 from jvr.model.interpolation import AbstractInterpolation
 from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
@@ -93,6 +94,7 @@ KINDS: dict[type, dict[str, str]] = {
         "disc": "EnvironmentLight.disc",
     },
     EnvironmentMap: {"image": "EnvironmentMap.from_image", "gradient": "EnvironmentMap.gradient"},
+    AbstractGeometry: {"image": "DepthImage.from_image"},
     AbstractOpticalModel: {
         "emission-absorption": "EmissionAbsorption",
         "emission-only": "EmissionOnly",

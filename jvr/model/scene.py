@@ -11,6 +11,7 @@ from jvr.model.clipping import AbstractClipping, ClippingBox
 from jvr.model.effects import AbstractMaterial, AbstractRadianceTransfer, AbstractScattering, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
 from jvr.model.environment_map import EnvironmentMap
+from jvr.model.geometry import AbstractGeometry
 from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
@@ -43,6 +44,7 @@ class Scene(AbstractPart):
     - `material`: what a point makes of the environment's light: a BRDF such as `jvr.MicrofacetBRDF(...)`, `jvr.HarmonicMaterial`,
       `jvr.MaterialByValue`, or `None`.
     - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
+    - `geometry`: opaque geometry that rays end at, `jvr.DepthImage`, or `None`.
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
       `jvr.ForwardDifferences()`, `jvr.CentralDifferences()`, `jvr.SobelDifferences()`, `jvr.PrecomputedGradient()`.
 
@@ -66,6 +68,7 @@ class Scene(AbstractPart):
     environment: EnvironmentLight | EnvironmentMap | None = parameter(doc="a jvr.EnvironmentLight or a jvr.EnvironmentMap")
     material: AbstractMaterial | None = parameter(doc="one of jvr's")
     radiance_transfer: AbstractRadianceTransfer | None = parameter(doc="a jvr.RadianceTransfer")
+    geometry: AbstractGeometry | None = parameter(doc="a jvr.DepthImage")
 
     def __init__(
         self,
@@ -83,12 +86,13 @@ class Scene(AbstractPart):
         environment: EnvironmentLight | EnvironmentMap | None = None,
         material: AbstractMaterial | None = None,
         radiance_transfer: AbstractRadianceTransfer | None = None,
+        geometry: AbstractGeometry | None = None,
     ):
         # None of several is no clipping.
         clipping = clipping if isinstance(clipping, AbstractClipping) or clipping else None
         assign(self, volume=volume, transfer=transfer, background=background, optical=optical, clipping=clipping)
         assign(self, lights=lights, shading=shading, shadows=shadows, scattering=scattering, normals=normals)
-        assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer)
+        assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer, geometry=geometry)
         _check_light(self)
         _check_environment(self)
 

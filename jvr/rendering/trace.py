@@ -13,7 +13,7 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.clipping import interval_inside, moved_clipping
 from jvr.model.environment_map import EnvironmentMap
 from jvr.model.scene import Scene
-from jvr.numerics import larger, one_minus_exp
+from jvr.numerics import larger, one_minus_exp, smaller
 from jvr.types import Scalar, Triple
 
 if TYPE_CHECKING:
@@ -39,9 +39,10 @@ def near_volume(scene: Scene, *others: Any) -> Any:
     positions are taken before they are rounded. Derivatives are those in the world of the scene."""
     scene, *cameras = promote_dtypes(scene, *others)
     origin = jax.lax.stop_gradient(scene.volume.origin)
-    placed = lambda s: (s.volume, s.clipping, s.lights)
+    placed = lambda s: (s.volume, s.clipping, s.lights, s.geometry)
     lights = tuple(light.moved(origin) for light in scene.lights)
-    parts = (scene.volume.moved(origin), moved_clipping(scene.clipping, origin), lights)
+    geometry = None if scene.geometry is None else scene.geometry.moved(origin)
+    parts = (scene.volume.moved(origin), moved_clipping(scene.clipping, origin), lights, geometry)
     scene = eqx.tree_at(placed, scene, parts, is_leaf=lambda x: x is None)
     return scene, *(camera.moved(origin) for camera in cameras)
 
@@ -60,20 +61,28 @@ def step_length(scene: Scene, settings: "Settings") -> Scalar:
 
 
 def enter(
-    scene: Scene, origin: Triple, direction: Triple, behind: Float[Array, "rays"] | float = 0.0
+    scene: Scene,
+    origin: Triple,
+    direction: Triple,
+    behind: Float[Array, "rays"] | float = 0.0,
+    pixels: Int[Array, "rays"] | None = None,
 ) -> tuple[Rays, Float[Array, "rays"]]:
     """World rays inside the volume (and its clipping), and the distance from the eye, which is `behind` their origin by so much, to
     where they enter.
 
-    Where what is behind differs from ray to ray, they know what they end at. A ray with non-finite numbers gets the length NaN, which
+    They end at opaque geometry, and where what is behind differs from ray to ray, they know what they see there. `pixels`: of each, `None`
+    where they are of none (`jvr.model.geometry.AbstractGeometry.hit`). A ray with non-finite numbers gets the length NaN, which
     `composite` turns into a NaN pixel.
     """
-    end = _end(scene, direction)
     start = scene.volume.grid_from_world(origin)
     along = scene.volume.grid_from_world(direction, direction=True)
     t_in, t_out = interval_inside(scene.volume, scene.clipping, (origin, direction), (start, along))
     t_in = larger(t_in, -behind)
+    met = None if scene.geometry is None else scene.geometry.hit((origin, direction), behind, pixels)
+    t_out = t_out if met is None else smaller(t_out, met[0])
     hit = t_out > t_in
+    # Those that miss are counted from the eye.
+    end = _end(scene, direction, met, jnp.where(hit, t_in, -behind))
     # A ray that misses gets harmless numbers before any arithmetic, so that its derivative is zero and not 0 * inf.
     t_in, t_out = jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0)
     keep = lambda v: tuple(jnp.where(hit, x, 0.0) for x in v)
@@ -83,18 +92,30 @@ def enter(
     return Rays(entry, along, t_out - t_in + poison, end), jnp.where(hit, behind + t_in, 0.0)
 
 
-def _end(scene: Scene, direction: Triple) -> End | None:
-    """What rays end at, `None` where that is a background of one colour or nothing at all."""
-    if not isinstance(scene.background, EnvironmentMap):
-        return None
-    far = scene.background.radiance(jnp.stack(direction, axis=1))
+def _end(
+    scene: Scene, direction: Triple, met: tuple[Float[Array, "rays"], Triple] | None, t_in: Float[Array, "rays"]
+) -> End | None:
+    """What rays end at that enter at `t_in`, `None` where that is a background of one colour or nothing at all. `met`: how far away
+    geometry is, and its radiance."""
     nothing = jnp.zeros_like(direction[0])
-    return End((far[:, 0], far[:, 1], far[:, 2]), nothing, nothing)
+    far, end = (nothing,) * 3, None
+    if isinstance(scene.background, EnvironmentMap):
+        seen = scene.background.radiance(jnp.stack(direction, axis=1))
+        far = (seen[:, 0], seen[:, 1], seen[:, 2])
+        end = End(far, nothing, nothing)
+    if met is None:
+        return end
+    t, rgb = met
+    there = t < jnp.inf
+    colours = tuple(jnp.where(there, near, behind) for near, behind in zip(rgb, far, strict=True))
+    return End(colours, there.astype(t.dtype), jnp.where(there, jnp.where(there, t, 0.0) - t_in, 0.0))
 
 
 def camera_rays(scene: Scene, camera: AbstractCamera, pixels: Int[Array, "rays"]) -> tuple[Rays, Float[Array, "rays"]]:
     """The rays of some pixels inside the volume, and the distance from the eye to where they enter; scene and camera near the volume."""
-    return enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)))
+    if scene.geometry is not None:
+        scene.geometry.check_view(camera)
+    return enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)), pixels)
 
 
 def composite(scene: Scene, gathered: Marched, rays: Rays) -> tuple[Triple, Float[Array, "rays"]]:

@@ -194,6 +194,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "ClippingBox": {"lower": [0.0, 0.0, 0.0], "upper": [1.0, 1.0, 1.0]},
     "ClippingPlane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 2.0]},
     "DeepShadowMap": {},
+    "DepthImage": {"depth": [[1.0]], "rgb": [[[0.1, 0.2, 0.3]]]},
     "Dipole": {"sigma_s_prime": [1.0, 2.0, 3.0], "sigma_a": [0.1, 0.2, 0.3]},
     "DirectionalLight": {"direction": [0.0, 0.0, 1.0]},
     "DoubleHenyeyGreenstein": {"g1": 0.3, "g2": -0.3, "weight": 0.5},

@@ -13,6 +13,7 @@ from jvr.io.config.environment import (
     background_of,
     environment_parts,
     fit_scene,
+    geometry_of,
     keeps_radiance_transfer,
     precomputed,
 )
@@ -209,7 +210,7 @@ def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
     fitted = () if tables.fit is None else tables.fit.unknowns
     if not any(name.startswith("volume.") for name in fitted):
         volume = graded(volume, light, transfer)
-    surroundings = {"background": background_of(config), "clipping": clipping}
+    surroundings = {"background": background_of(config), "clipping": clipping, "geometry": geometry_of(config)}
     if tables.optical is not None:
         surroundings["optical"] = made(config.where, "optical", tables.optical)
     return Scene(volume, transfer, **surroundings, **light)
@@ -257,7 +258,7 @@ def _all_keywords(config: Config, fit: FitTable, scene: Scene, cameras: tuple[Ab
         "unknowns": unknowns_of(config, fit, scene, cameras),
         "settings": build_settings(config),
     }
-    return keywords | {"transforms": transforms_of(fit, scene.volume)}
+    return keywords | {"transforms": transforms_of(fit, scene.volume, len(cameras))}
 
 
 def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:

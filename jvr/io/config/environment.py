@@ -11,6 +11,7 @@ from jvr.io.config.load import Config
 from jvr.io.config.parts import made
 from jvr.io.config.schema.environment import (
     EnvironmentTable,
+    GeometryImageTable,
     ImageTable,
     MaterialsTable,
     MaterialTable,
@@ -57,6 +58,17 @@ def background_of(config: Config) -> Any:
         found = made(config.where, "background", table, "rotation")
     with blame(config.where("background"), "background"):
         return found.rotated(_rotation(table.rotation)) if table.rotation else found
+
+
+def geometry_of(config: Config) -> Any:
+    """The opaque geometry of a configuration, or `None`."""
+    table = config.tables.geometry
+    if not isinstance(table, GeometryImageTable):
+        return None if table is None else made(config.where, "geometry", table)
+    place = "geometry.path"
+    image = config.find(table.path, place, table.source)
+    with blame(config.where(place), place):
+        return table.part(image)
 
 
 def precomputed(scene: Scene, **keywords: Any) -> Scene:

@@ -14,6 +14,7 @@ from jvr.io.config.schema.table import Colour, Positions, Steepness, Table, one_
 from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
 from jvr.model.environment import EnvironmentLight
 from jvr.model.environment_map import EnvironmentMap
+from jvr.model.geometry import AbstractGeometry
 from jvr.model.material import AbstractBRDF
 from jvr.model.ranges import DIRECTION, NOT_NEGATIVE
 
@@ -57,6 +58,15 @@ class SurroundingsImageTable(SurroundingsTable):
     scale: Annotated[float, number("factor between the map's radiance and the scene's", NOT_NEGATIVE)] = 1.0
 
 
+class GeometryImageTable(KindTable):
+    """Where the picture of geometry lies, with its depth."""
+
+    path: str
+    source: str | None = None
+
+
+BASES[AbstractGeometry, "image"] = GeometryImageTable
+Geometry = Annotated[Any, part(AbstractGeometry)]
 BASES |= {EnvironmentLight: EnvironmentTable, (EnvironmentLight, "image"): ImageTable}
 BASES |= {EnvironmentMap: SurroundingsTable, (EnvironmentMap, "image"): SurroundingsImageTable}
 Environments = Annotated[list[Annotated[Any, part(EnvironmentLight)]], BeforeValidator(one_or_more)]
