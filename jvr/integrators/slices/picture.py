@@ -179,7 +179,7 @@ def _level(
     place = lambda n: 2**level * (jnp.arange(n) - 0.5) - 0.5
     row, column = (x.reshape(-1) for x in jnp.meshgrid(place(height), place(width), indexing="ij"))
     origin, direction, behind = plane.rays(column, row)
-    rays, t_in = enter(scene, origin, direction, behind)
+    rays, t_in = enter(scene, origin, direction, behind, limits=plane.limits(direction))
     along = scene.volume.grid_from_world(direction, direction=True)
     starts = jnp.where(rays.length > 0, t_in, behind)
     return column, row, rays, t_in, (starts, *scene.volume.grid_from_world(origin), *along)
