@@ -62,8 +62,11 @@ class LitShader(OpticalShader):
         # What glows by itself needs no light.
         return self.optical.evaluate_segment(classified._replace(rgb=rgb), dt)
 
-    def light_at(self, sample: Sample, point: Point, classified: Classified, dt: Scalar) -> tuple[Triple, Triple]:
-        """`a` and `b` of a sample that stands for a segment of length `dt` of a medium."""
+    def light_at(
+        self, sample: Sample, point: Point, classified: Classified, dt: Scalar, *, is_surface: bool = False
+    ) -> tuple[Triple, Triple]:
+        """`a` and `b` of a sample that stands for a segment of length `dt` of a medium, or of a point that `is_surface` whatever the length
+        of its gradient."""
         zero = jnp.zeros_like(sample.s)
         x = transformed(self.world_from_grid, point.p)
         w_o, _ = direction_and_length(turned(-self.world_from_grid[:3, :3], point.direction))
@@ -71,6 +74,8 @@ class LitShader(OpticalShader):
         normal, magnitude = direction_and_length(tuple(-g for g in sample.gradient)) if sample.gradient else ((zero,) * 3, zero)
         surface = zero if shading is None else shading.surface_weight(magnitude)
         cut = zero
+        if is_surface:
+            surface = cut = surface_weight(magnitude, zero)
         if self.cut is not None:
             # What is hardly a surface has hardly a say in the normal.
             weight = (

@@ -142,10 +142,10 @@ def composite(scene: Scene, gathered: Marched, rays: Rays) -> tuple[Triple, Floa
     transmittances = tuple(jnp.exp(-tau) for tau in gathered.tau)
     zero = jnp.where(jnp.isnan(rays.length), jnp.nan, 0.0)
     rgb = tuple(zero + L for L in gathered.radiance or (0.0, 0.0, 0.0))
-    behind = _behind(scene, rays)
-    if behind is not None:
+    far = behind(scene, rays)
+    if far is not None:
         clear = transmittances * (3 // len(transmittances)) if transmittances else (1.0, 1.0, 1.0)
-        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, behind, strict=True))
+        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, far, strict=True))
     # Not 1 - T: thin media keep their digits.
     alpha = sum((one_minus_exp(tau) for tau in gathered.tau), zero) / max(len(gathered.tau), 1)
     return rgb, alpha if rays.end is None else alpha + seen_end(gathered, rays.end)
@@ -157,7 +157,7 @@ def seen_end(gathered: Marched, end: End) -> Float[Array, "rays"]:
     return end.opaque * (sum(transmittances, jnp.zeros_like(end.opaque)) / len(transmittances) if transmittances else 1.0)
 
 
-def _behind(scene: Scene, rays: Rays) -> Any:
+def behind(scene: Scene, rays: Rays) -> Any:
     """Radiance behind the medium in three channels, or `None` where there is none."""
     colour, end = scene.background_colour, rays.end
     if end is None:

@@ -114,6 +114,8 @@ def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
         raise ValueError(f"jvr.Slices() interpolates between samples, which {name}() volumes do not allow: {UNIFORM}")
     if scene.shows_light:
         raise ValueError(f"jvr.Slices() does not know light: {UNIFORM}, or take shading and scattering out of the scene")
+    if scene.surfaces is not None:
+        raise ValueError(f"jvr.Slices() does not know surfaces: {UNIFORM}")
     if scene.geometry is not None:
         raise ValueError(f"jvr.Slices() does not know geometry, at whose edges rays end apart: {UNIFORM}")
     if not isinstance(settings.adjoint, Replay):
