@@ -7,6 +7,7 @@ from jvr.names import NAMES
 
 if TYPE_CHECKING:
     from jvr.effects.deep_shadow_map import DeepShadowMap as DeepShadowMap
+    from jvr.effects.occlusion import LocalOcclusion as LocalOcclusion
     from jvr.effects.radiance_transfer import MaterialBleeding as MaterialBleeding
     from jvr.effects.radiance_transfer import RadianceTransfer as RadianceTransfer
     from jvr.effects.radiance_transfer import TransferBleeding as TransferBleeding

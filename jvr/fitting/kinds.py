@@ -126,8 +126,9 @@ def march_unknowns(problem: Problem) -> int:
 
 def adjoint_of(problem: Problem) -> AbstractAdjoint:
     """How the whole residual vector is differentiated."""
-    # Rows do not know light that changes on its way: that of an environment, through a radiance transfer.
-    around = lambda m: () if m.scene.radiance_transfer is None else (m.scene.environment_lights, m.scene.radiance_transfer)
+    # Rows do not know light that changes on its way: that of an environment, through a radiance transfer; ambient light.
+    transferred = lambda m: () if m.scene.radiance_transfer is None else (m.scene.environment_lights, m.scene.radiance_transfer)
+    around = lambda m: (transferred(m), m.scene.occlusion)
     known = _has_rows(problem) and not problem.unknowns.among(problem.model, around) and problem.model.views is None
     return Rows() if known else Forward()
 
@@ -144,7 +145,7 @@ def _after_march(problem: Problem) -> frozenset[int]:
 def has_table_jacobian(scene: Scene) -> bool:
     """Whether entries of the transfer function act through what a sample is classified as, and nothing else."""
     by_gradient = scene.needs_gradient and scene.normals.follows_transfer(scene.volume)
-    shade = scene.shadows is not None or (scene.radiance_transfer is not None and not scene.radiance_transfer.is_frozen)
+    shade = scene.shadows is not None or any(not getattr(scene, field).is_frozen for field in scene.precomputable)
     return isinstance(scene.transfer, AbstractTable) and not shade and not by_gradient
 
 

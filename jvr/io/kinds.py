@@ -13,6 +13,7 @@ from jvr.march.quadrature import AbstractQuadrature
 from jvr.model.camera import AbstractCamera
 from jvr.model.effects import (
     AbstractBleeding,
+    AbstractOcclusion,
     AbstractRadianceTransfer,
     AbstractScattering,
     AbstractShading,
@@ -71,6 +72,7 @@ KINDS: dict[type, dict[str, str]] = {
         "precomputed": "PrecomputedGradient",
     },
     AbstractRadianceTransfer: {"projected": "RadianceTransfer"},
+    AbstractOcclusion: {"local": "LocalOcclusion"},
     AbstractTransfer: {
         "linear": "LinearTransfer",
         "lut": "LutTransfer",

@@ -1,6 +1,7 @@
 """Grids over one domain: the voxels of a volume on a coarser or a finer grid."""
 
 import dataclasses
+import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -49,4 +50,22 @@ def on_grid(volume: Volume, shape: Shape) -> Volume:
 def coarser(shape: Shape) -> Shape:
     """The grid whose voxels lie twice as far apart, or a little less where the ends of an axis would not be among them."""
     x, y, z = (n // 2 + 1 if n > 1 else 1 for n in shape)
+    return x, y, z
+
+
+def node_shape(volume: Volume, resolution: float) -> Shape:
+    """The grid with so many nodes for each voxel along an axis, or a few more where the ends of an axis would not be among them."""
+    x, y, z = (1 if n == 1 else max(2, math.ceil((n - 1) * resolution) + 1) for n in volume.shape)
+    return x, y, z
+
+
+def node_positions(volume: Volume, shape: Shape) -> Float[np.ndarray, "nodes 3"]:
+    """Grid positions of the nodes of a grid over a volume: equally distant, the first and the last at the border."""
+    axes = [np.linspace(0, n - 1, m) if n > 1 else np.zeros(1) for n, m in zip(volume.shape, shape, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+
+
+def nodes_for_each_voxel(volume: Volume, shape: Shape) -> tuple[float, float, float]:
+    """What takes a grid position to the coordinates of such a grid's nodes, along each axis."""
+    x, y, z = ((m - 1) / (n - 1) if n > 1 else 0.0 for n, m in zip(volume.shape, shape, strict=True))
     return x, y, z

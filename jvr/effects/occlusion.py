@@ -1,0 +1,263 @@
+"""Local ambient occlusion: how much of the ambient light the medium near a point takes away (Hernell, Ljung and Ynnerman, "Local ambient
+occlusion in direct volume rendering", IEEE TVCG 16(4), 2010; course notes on GPU-based volume ray-casting, Eurographics 2009,
+section 6.1).
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt32
+
+from jvr.effects.grid import Grid
+from jvr.effects.nodes import AbstractProjection, project_all
+from jvr.march.medium import AbstractVisibility, LightPath, Medium
+from jvr.march.rules import perturbed
+from jvr.march.secondary import SecondaryRays, channel_count, secondary_rays, take_midpoint
+from jvr.march.steps import Point, Transmittances
+from jvr.model.clipping import ClippingBox
+from jvr.model.effects import AbstractOcclusion, stale_message
+from jvr.model.grids import Shape, node_shape, nodes_for_each_voxel
+from jvr.model.parameters import assign, choice, parameter
+from jvr.model.parts import Knob, multiples
+from jvr.model.ranges import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL, Interval
+from jvr.model.scene import Scene
+from jvr.model.volume import Volume
+from jvr.numerics import clamp, divide_or_zero, larger, mean_transmittance
+from jvr.types import ArrayLike, Channels, Scalar
+
+# Radius and offset where a scene says none, in voxels of the smallest spacing.
+RADIUS, OFFSET = 16.0, 1.0
+# Azimuth between one direction and the next, the golden angle.
+GOLDEN = math.pi * (3 - math.sqrt(5))
+
+
+class LocalOcclusion(AbstractOcclusion):
+    """Local ambient occlusion: the mean over directions of the light that is scattered to a point from within a ball around it.
+
+        I(x) = 1 / K sum_k 1 / (R - a) integral_a^R exp(-integral_a^s sigma_t du) ds        (notes, equations 6.1 and 6.3)
+
+    along `K` rays from `x`, so that shadows fade in with distance. Ambient light is multiplied with `(bias + (1 - bias) I)^gamma`, which
+    is 1 where nothing is near and `bias^gamma` where everything is opaque (equation 6.4 has `(bias + I)^gamma`, which exceeds 1).
+    Coloured extinction has an `I` for each channel. Where the volume or its clipping box ends there is nothing more.
+
+    `I` is found at the nodes of a grid near which something is visible, and is trilinear in between. Along a ray extinction is constant
+    in each of `samples` segments, whose integral is exact: what is homogeneous has no error of the quadrature.
+
+    **Arguments:**
+
+    - `rays`: `K`, for each node, on a spiral of equal areas, the same at all nodes.
+    - `radius`, `offset`: `R` and `a`, world lengths, not negative; by default 16 and 1 times the smallest spacing. With `radius` no larger
+      than `offset` nothing is occluded, which is the limit of ever smaller balls.
+    - `samples`: segments along each ray.
+    - `resolution`: nodes for each voxel along an axis, above 0 and at most 1.
+    - `bias`: 0 ... 1; `gamma`: positive.
+
+    Differentiable in transfer function, voxels, `radius`, `offset`, `bias` and `gamma` while it is not computed beforehand; then each
+    picture does it anew. `jvr.precompute(scene)` does it once and keeps `I`, which is then a constant: `bias`, `gamma`, camera and lights
+    may change, what it was made of may not, unless it is `pinned()`. Costs `rays x samples` samples for each node. **Raises** `ValueError`
+    for numbers outside their ranges.
+    """
+
+    rays: int = choice(AT_LEAST_ONE, doc="rays for each node")
+    radius: Scalar | None = parameter(NOT_NEGATIVE, doc="of the ball that rays see", unit="mm")
+    offset: Scalar | None = parameter(NOT_NEGATIVE, doc="how far from a point its rays begin", unit="mm")
+    samples: int = choice(AT_LEAST_ONE, doc="segments along each ray")
+    resolution: float = choice(Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start")
+    bias: Scalar = parameter(UNIT_INTERVAL, doc="share of ambient light that nothing takes away")
+    gamma: Scalar = parameter(POSITIVE, doc="exponent of what is left of ambient light")
+    projected: "ProjectedOcclusion | None" = parameter(doc="what has been computed beforehand")
+
+    def __init__(
+        self,
+        rays: int = 32,
+        *,
+        radius: ArrayLike | None = None,
+        offset: ArrayLike | None = None,
+        samples: int = 16,
+        resolution: float | int = 0.5,
+        bias: ArrayLike = 0.0,
+        gamma: ArrayLike = 1.0,
+    ):
+        assign(self, rays=rays, radius=radius, offset=offset, samples=samples, resolution=resolution, bias=bias, gamma=gamma)
+        self.projected = None
+
+    def knobs(self, scene: Scene) -> tuple[Knob, ...]:
+        # Of what has been computed beforehand nothing can be saved.
+        if self.is_frozen:
+            return ()
+        return (
+            multiples("rays", self.rays, (1 / 4, 1 / 2, 1), 4, least=1),
+            multiples("samples", self.samples, (1 / 4, 1 / 2, 1), 2, least=1),
+            multiples("resolution", self.resolution, (1 / 2, 1), 2, most=1.0),
+        )
+
+    def turned(self, knob: str, value: Any) -> "LocalOcclusion":
+        same = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "projected"}
+        changed = LocalOcclusion(**(same | {knob: value}))
+        return changed if self.projected is None else changed.with_projected(self.projected)
+
+    @property
+    def is_final(self) -> bool:
+        return self.is_frozen
+
+    @property
+    def stale_message(self) -> str:
+        return stale_message("occlusion", "occlusion", "transfer function, volume, clipping box, radius or offset")
+
+    def sources(self, scene: Scene) -> Any:
+        volume, graded = scene.volume, scene.transfer.takes_gradient
+        parts = [volume.values, volume.gaps, volume.slope, volume.intercept, volume.world_from_grid, volume.interpolation]
+        return parts, scene.transfer, scene.clipping, scene.normals if graded else None, self.radius, self.offset
+
+    def projection(self, scene: Scene, path: LightPath) -> "OcclusionProjection":
+        spacing = jnp.min(scene.volume.spacing)
+        offset, radius = (
+            by_default * spacing if given is None else given
+            for by_default, given in ((OFFSET, self.offset), (RADIUS, self.radius))
+        )
+        fractions = jnp.arange(self.samples + 1, dtype=spacing.dtype) / self.samples
+        return OcclusionProjection(
+            volume=scene.volume,
+            clipping=scene.clipping,
+            medium=path(scene.transfer.takes_gradient),
+            ends=offset + larger(radius - offset, 0.0) * fractions,
+            rays=self.rays,
+            resolution=self.resolution,
+        )
+
+    def finished(self, scene: Scene, *nodes: Any) -> "ProjectedOcclusion":
+        (taken,) = nodes
+        taken = taken.reshape(*node_shape(scene.volume, self.resolution), -1)
+        return ProjectedOcclusion(taken, jnp.asarray(self.cache_key(scene)))
+
+    def visibility(self, scene: Scene, path: LightPath) -> "OcclusionVisibility":
+        if self.projected is None:
+            (taken,) = _all_nodes(self.projection(scene, path))
+            taken = taken.reshape(*node_shape(scene.volume, self.resolution), -1)
+        else:
+            taken = self.projected.taken
+        left = jnp.power(self.bias + (1 - self.bias) * (1 - taken), self.gamma)
+        x, y, z = taken.shape[:3]
+        return OcclusionVisibility(Grid.of(left), nodes_for_each_voxel(scene.volume, (x, y, z)))
+
+
+class ProjectedOcclusion(eqx.Module):
+    """Occlusion as it was computed.
+
+    - `taken`: `(x, y, z, 1)`, or `(x, y, z, 3)` for coloured extinction: `1 - I`, which is also 0 where nothing is visible and nothing was
+      computed.
+    - `cache_key`: checksums of what it was made of (`jvr.model.kept.content`).
+    - `pinned`: whether it stays as it is although the scene is another.
+    """
+
+    taken: Float[Array, "x y z channels"]
+    cache_key: UInt32[Array, "parts 2"]
+    pinned: bool = eqx.field(static=True, default=False)
+
+
+class OcclusionVisibility(AbstractVisibility):
+    """What arrives of ambient light, known at the nodes of a grid."""
+
+    grid: Grid
+    scale: tuple[float, float, float] = eqx.field(static=True)
+
+    def transmittances(self, points: Point, wanted: Any, *, reverse: bool) -> Transmittances:
+        at = tuple(c * f for c, f in zip(points.p, self.scale, strict=True))
+        return Transmittances(ambient=self.grid.interpolate(at, wanted))
+
+    @property
+    def stats(self) -> None:
+        return None
+
+
+class OcclusionProjection(AbstractProjection):
+    """All that the nodes of a scene are computed with. `ends`: of the segments of `rays` rays, distances from their node."""
+
+    volume: Volume
+    clipping: ClippingBox | None
+    medium: Medium
+    ends: Float[Array, "ends"]
+    rays: int = eqx.field(static=True)
+    resolution: float = eqx.field(static=True)
+
+    @property
+    def shape(self) -> Shape:
+        return node_shape(self.volume, self.resolution)
+
+    def project(self, p: Float[Array, "nodes 3"]) -> tuple[Float[Array, "nodes channels"]]:
+        """`1 - I` at grid positions."""
+
+        # Checkpointed: the reverse pass knows the nodes, and marches their rays again rather than keep them all.
+        @jax.checkpoint
+        def taken(projection: "OcclusionProjection", p: Float[Array, "nodes 3"]) -> Float[Array, "nodes channels"]:
+            rays = short_rays(projection.volume, projection.clipping, projection.rays, p)
+            means = _mean_transmittances(projection, rays, projection.ends)
+            return 1 - jnp.stack([jnp.mean(mean.reshape(p.shape[0], -1), axis=1) for mean in means], axis=-1)
+
+        return (taken(self, p),)
+
+
+def short_rays(volume: Volume, clipping: ClippingBox | None, number: int, p: Float[Array, "nodes 3"]) -> SecondaryRays:
+    """A `number` of rays from each of some grid positions in all directions, those of a position one after the other."""
+    dtype = volume.slope.dtype
+    origin = tuple(jnp.repeat(c.astype(dtype), number) for c in p.T)
+    along = tuple(jnp.tile(jnp.asarray(d, dtype), p.shape[0]) for d in _sphere(number).T)
+    grid = origin, volume.grid_from_world(along, direction=True)
+    return secondary_rays(volume, clipping, (volume.world_from_point(origin), along), grid)
+
+
+def _sphere(rays: int) -> Float[np.ndarray, "rays 3"]:
+    """Unit directions on a spiral of equal areas."""
+    index = np.arange(rays)
+    cosine = 1 - (2 * index + 1) / rays
+    sine = np.sqrt((1 - cosine) * (1 + cosine))
+    return np.stack([sine * np.cos(GOLDEN * index), sine * np.sin(GOLDEN * index), cosine], axis=1)
+
+
+def _mean_transmittances(projection: OcclusionProjection, rays: SecondaryRays, ends: Float[Array, "ends"]) -> Channels:
+    """The mean transmittance of each ray between its ends."""
+    volume, medium = projection.volume, projection.medium
+
+    def step(state: tuple[Channels, Channels], ends: tuple[Scalar, Scalar]) -> tuple[tuple[Channels, Channels], None]:
+        tau, total = state
+        begin, end = ends
+        dtau, _, _ = take_midpoint(medium, volume, rays, begin, end, True)
+        # What of the segment lies before the medium, in it and behind it.
+        enters, leaves = clamp(rays.t_in, begin, end), clamp(rays.t_out, begin, end)
+        before, inside = (divide_or_zero(t, end - begin) for t in (enters - begin, larger(leaves - enters, 0.0)))
+        behind = 1 - before - inside
+        seen = (
+            jnp.exp(-t) * (before + inside * mean_transmittance(d) + behind * jnp.exp(-d)) for t, d in zip(tau, dtau, strict=True)
+        )
+        total = tuple(a + b for a, b in zip(total, seen, strict=True))
+        return (tuple(t + d for t, d in zip(tau, dtau, strict=True)), total), None
+
+    zero = (jnp.zeros_like(rays.t_out),) * channel_count(medium, volume, rays)
+    (_, total), _ = jax.lax.scan(jax.checkpoint(step), (zero, zero), (ends[:-1], ends[1:]))
+    return tuple(channel / (ends.shape[0] - 1) for channel in total)
+
+
+@jax.custom_jvp
+def _all_nodes(projection: OcclusionProjection) -> tuple[Array, ...]:
+    """What the active nodes of a scene hold. Where it is differentiated all of them do: what is not visible may become so, and has a
+    derivative in the light that reaches it."""
+    return projection.all_nodes()
+
+
+def _all_nodes_rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    tangents = perturbed(primals, tangents)
+    moving, still = eqx.partition(primals, jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None))
+
+    def whole(moving: Any) -> tuple[Array, ...]:
+        (projection,) = eqx.combine(moving, still)
+        return project_all(projection, jnp.ones(math.prod(projection.shape), bool))
+
+    return jax.jvp(whole, (moving,), (tangents,))
+
+
+_all_nodes.defjvp(_all_nodes_rule, symbolic_zeros=True)
