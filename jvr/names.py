@@ -26,6 +26,7 @@ class Renamed:
 
 NAMES = {
     "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
+    "jvr.effects.histogram_occlusion": ("HistogramOcclusion", "LocalHistograms"),
     "jvr.effects.occlusion": ("LocalOcclusion",),
     "jvr.effects.radiance_transfer": ("MaterialBleeding", "RadianceTransfer", "TransferBleeding"),
     "jvr.effects.scattering": ("SingleScattering",),

@@ -29,7 +29,7 @@ from jvr.io.config.schema.parts import kinds_of, table_for
 from jvr.march.differentiation import AbstractAdjoint
 from jvr.march.quadrature import AbstractQuadrature
 from jvr.model.camera import AbstractCamera
-from jvr.model.effects import AbstractShading, AbstractShadows
+from jvr.model.effects import AbstractOcclusion, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
 from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
@@ -168,6 +168,7 @@ FAMILIES = {
     "[[lights]]": AbstractLight,
     "[shading]": AbstractShading,
     "[shadows]": AbstractShadows,
+    "[occlusion]": AbstractOcclusion,
     "[scattering.phase]": AbstractPhase,
     "[normals]": AbstractNormals,
     "[material]": AbstractBRDF,

@@ -115,17 +115,11 @@ class LocalOcclusion(AbstractOcclusion):
         return parts, scene.transfer, scene.clipping, scene.normals if graded else None, self.radius, self.offset
 
     def projection(self, scene: Scene, path: LightPath) -> "OcclusionProjection":
-        spacing = jnp.min(scene.volume.spacing)
-        offset, radius = (
-            by_default * spacing if given is None else given
-            for by_default, given in ((OFFSET, self.offset), (RADIUS, self.radius))
-        )
-        fractions = jnp.arange(self.samples + 1, dtype=spacing.dtype) / self.samples
         return OcclusionProjection(
             volume=scene.volume,
             clipping=scene.clipping,
             medium=path(scene.transfer.takes_gradient),
-            ends=offset + larger(radius - offset, 0.0) * fractions,
+            reach=Reach.of(self, scene.volume),
             rays=self.rays,
             resolution=self.resolution,
         )
@@ -141,9 +135,7 @@ class LocalOcclusion(AbstractOcclusion):
             taken = taken.reshape(*node_shape(scene.volume, self.resolution), -1)
         else:
             taken = self.projected.taken
-        left = jnp.power(self.bias + (1 - self.bias) * (1 - taken), self.gamma)
-        x, y, z = taken.shape[:3]
-        return OcclusionVisibility(Grid.of(left), nodes_for_each_voxel(scene.volume, (x, y, z)))
+        return occlusion_visibility(self, scene.volume, taken)
 
 
 class ProjectedOcclusion(eqx.Module):
@@ -175,13 +167,20 @@ class OcclusionVisibility(AbstractVisibility):
         return None
 
 
+def occlusion_visibility(occlusion: Any, volume: Volume, taken: Float[Array, "x y z channels"]) -> OcclusionVisibility:
+    """What nodes leave of ambient light that take away so much of it, by the `bias` and `gamma` of an occlusion."""
+    left = jnp.power(occlusion.bias + (1 - occlusion.bias) * (1 - taken), occlusion.gamma)
+    x, y, z = taken.shape[:3]
+    return OcclusionVisibility(Grid.of(left), nodes_for_each_voxel(volume, (x, y, z)))
+
+
 class OcclusionProjection(AbstractProjection):
-    """All that the nodes of a scene are computed with. `ends`: of the segments of `rays` rays, distances from their node."""
+    """All that the nodes of a scene are computed with, `rays` rays from each."""
 
     volume: Volume
     clipping: ClippingBox | None
     medium: Medium
-    ends: Float[Array, "ends"]
+    reach: Reach
     rays: int = eqx.field(static=True)
     resolution: float = eqx.field(static=True)
 
@@ -196,10 +195,30 @@ class OcclusionProjection(AbstractProjection):
         @jax.checkpoint
         def taken(projection: "OcclusionProjection", p: Float[Array, "nodes 3"]) -> Float[Array, "nodes channels"]:
             rays = short_rays(projection.volume, projection.clipping, projection.rays, p)
-            means = _mean_transmittances(projection, rays, projection.ends)
+            means = _mean_transmittances(projection, rays)
             return 1 - jnp.stack([jnp.mean(mean.reshape(p.shape[0], -1), axis=1) for mean in means], axis=-1)
 
         return (taken(self, p),)
+
+
+class Reach(eqx.Module):
+    """How far rays go. `ends`: of their segments, distances from where they begin, all the same where there is nothing between `offset` and
+    `radius` of an occlusion; `length`: from the one to the other; `beyond`: the fraction of it that lies behind the last segment, out of
+    the volume, which no ray is longer than."""
+
+    ends: Float[Array, "ends"]
+    length: Scalar
+    beyond: Scalar
+
+    @classmethod
+    def of(cls, occlusion: Any, volume: Volume) -> "Reach":
+        spacing = jnp.min(volume.spacing)
+        offset = OFFSET * spacing if occlusion.offset is None else occlusion.offset
+        radius = RADIUS * spacing if occlusion.radius is None else occlusion.radius
+        length = larger(radius - offset, 0.0)
+        inside = clamp(2 * volume.radius - offset, jnp.zeros_like(length), length)
+        ends = offset + inside * jnp.linspace(0.0, 1.0, occlusion.samples + 1, dtype=spacing.dtype)
+        return cls(ends, length, divide_or_zero(length - inside, length))
 
 
 def short_rays(volume: Volume, clipping: ClippingBox | None, number: int, p: Float[Array, "nodes 3"]) -> SecondaryRays:
@@ -219,17 +238,15 @@ def _sphere(rays: int) -> Float[np.ndarray, "rays 3"]:
     return np.stack([sine * np.cos(GOLDEN * index), sine * np.sin(GOLDEN * index), cosine], axis=1)
 
 
-def _mean_transmittances(projection: OcclusionProjection, rays: SecondaryRays, ends: Float[Array, "ends"]) -> Channels:
-    """The mean transmittance of each ray between its ends."""
-    volume, medium = projection.volume, projection.medium
+def _mean_transmittances(projection: OcclusionProjection, rays: SecondaryRays) -> Channels:
+    """The mean transmittance of each ray over its length."""
+    volume, medium, reach = projection.volume, projection.medium, projection.reach
 
     def step(state: tuple[Channels, Channels], ends: tuple[Scalar, Scalar]) -> tuple[tuple[Channels, Channels], None]:
         tau, total = state
         begin, end = ends
         dtau, _, _ = take_midpoint(medium, volume, rays, begin, end, True)
-        # What of the segment lies before the medium, in it and behind it.
-        enters, leaves = clamp(rays.t_in, begin, end), clamp(rays.t_out, begin, end)
-        before, inside = (divide_or_zero(t, end - begin) for t in (enters - begin, larger(leaves - enters, 0.0)))
+        before, inside = fractions_inside(rays, begin, end)
         behind = 1 - before - inside
         seen = (
             jnp.exp(-t) * (before + inside * mean_transmittance(d) + behind * jnp.exp(-d)) for t, d in zip(tau, dtau, strict=True)
@@ -238,8 +255,16 @@ def _mean_transmittances(projection: OcclusionProjection, rays: SecondaryRays, e
         return (tuple(t + d for t, d in zip(tau, dtau, strict=True)), total), None
 
     zero = (jnp.zeros_like(rays.t_out),) * channel_count(medium, volume, rays)
-    (_, total), _ = jax.lax.scan(jax.checkpoint(step), (zero, zero), (ends[:-1], ends[1:]))
-    return tuple(channel / (ends.shape[0] - 1) for channel in total)
+    (tau, total), _ = jax.lax.scan(jax.checkpoint(step), (zero, zero), (reach.ends[:-1], reach.ends[1:]))
+    segments = reach.ends.shape[0] - 1
+    return tuple((1 - reach.beyond) * c / segments + reach.beyond * jnp.exp(-t) for c, t in zip(total, tau, strict=True))
+
+
+def fractions_inside(rays: SecondaryRays, begin: Scalar, end: Scalar) -> tuple[Float[Array, "rays"], Float[Array, "rays"]]:
+    """What of a segment of each ray lies before the medium, and in it."""
+    enters, leaves = clamp(rays.t_in, begin, end), clamp(rays.t_out, begin, end)
+    length = jnp.broadcast_to(end - begin, enters.shape)
+    return divide_or_zero(enters - begin, length), divide_or_zero(larger(leaves - enters, 0.0), length)
 
 
 @jax.custom_jvp

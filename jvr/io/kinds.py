@@ -72,7 +72,7 @@ KINDS: dict[type, dict[str, str]] = {
         "precomputed": "PrecomputedGradient",
     },
     AbstractRadianceTransfer: {"projected": "RadianceTransfer"},
-    AbstractOcclusion: {"local": "LocalOcclusion"},
+    AbstractOcclusion: {"local": "LocalOcclusion", "histogram": "HistogramOcclusion"},
     AbstractTransfer: {
         "linear": "LinearTransfer",
         "lut": "LutTransfer",

@@ -139,8 +139,6 @@ class AbstractPrecomputable(AbstractPart):
     # what it was made of, and whether it is `pinned`.
     projected: eqx.AbstractVar[Any]
 
-    outdated, made_for = Renamed("stale"), Renamed("cache_key")
-
     @property
     def is_frozen(self) -> bool:
         """Whether it has been computed beforehand, so that it does not follow the scene."""
@@ -224,6 +222,8 @@ class AbstractRadianceTransfer(AbstractPrecomputable):
     order: eqx.AbstractVar[int]
     # What scatters light between nodes, or `None`.
     scattering: eqx.AbstractVar[Any]
+
+    outdated, made_for = Renamed("stale"), Renamed("cache_key")
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         made = "computed beforehand" if self.is_frozen else "computed in each picture: jvr.precompute"

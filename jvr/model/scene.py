@@ -49,7 +49,8 @@ class Scene(AbstractPart):
     - `material`: what a point makes of the environment's light: a BRDF such as `jvr.MicrofacetBRDF(...)`, `jvr.HarmonicMaterial`,
       `jvr.MaterialByValue`, or `None`.
     - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
-    - `occlusion`: how much of the ambient light the medium near a point takes away: `jvr.LocalOcclusion(...)`, or `None`: nothing.
+    - `occlusion`: how much of the ambient light the medium near a point takes away: `jvr.LocalOcclusion(...)`,
+      `jvr.HistogramOcclusion(...)`, or `None`: nothing.
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
       `jvr.ForwardDifferences()`, `jvr.CentralDifferences()`, `jvr.SobelDifferences()`, `jvr.PrecomputedGradient()`.
 

@@ -153,6 +153,10 @@ SCENES = {
     "kept": lambda: lit(jvr.Volume(voxels(SHAPE)).bricked(3).graded(), normals=jvr.PrecomputedGradient()),
     "packed": lambda: scene(jvr.Volume(voxels(SHAPE), missing=3.0).packed().bricked()),
     "natural": lambda: natural(radiance_transfer=jvr.RadianceTransfer(exact=True)),
+    "occluded": lambda: lit(lights=[jvr.AmbientLight()], occlusion=jvr.LocalOcclusion(8, radius=2, samples=3, bias=0.1)),
+    "histograms": lambda: jvr.precompute(
+        lit(lights=[jvr.AmbientLight()], occlusion=jvr.HistogramOcclusion(4, 3, samples=2, resolution=0.3, bleeding=0.5))
+    ),
     "negative": lambda: natural(environment=jvr.EnvironmentLight(-0.0 * np.ones((4, 3)), clamped=False)),
     "materials": materials,
     "projected": projected,

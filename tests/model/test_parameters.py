@@ -205,10 +205,12 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "HarmonicMaterial": {"tinted": None, "plain": None, "positions": [0.0, 1.0]},
     "HeadLight": {},
     "HenyeyGreenstein": {"g": 0.3},
+    "HistogramOcclusion": {"radius": 3.0, "offset": 0.5, "bleeding": 0.5},
     "JendersieEon": {"diameter": 10.0},
     "Lambert": {},
     "LambertBRDF": {},
     "LinearTransfer": {"positions": [0.0, 1.0], "rgb": RGB, "sigma_t": [0.1, 0.2]},
+    "LocalOcclusion": {"radius": 3.0, "offset": 0.5},
     "LutTransfer": {"rgb": RGB, "sigma_t": [0.1, 0.2], "domain": [0.0, 1.0]},
     "MaterialByValue": {"positions": [0.0, 1.0], "materials": [jvr.LambertBRDF(), jvr.LambertBRDF()]},
     "MerlBRDF": {"table": np.full((2, 2, 2, 3), 0.1)},
@@ -253,6 +255,10 @@ FORBIDDEN = {
 UNDECLARED = {
     ("HarmonicMaterial", "tinted"): "made by project",
     ("HarmonicMaterial", "plain"): "made by project",
+    ("LocalHistograms", "weights"): "made of a volume",
+    ("LocalHistograms", "positions"): "made of a volume",
+    ("LocalHistograms", "length"): "made of a volume",
+    ("LocalHistograms", "cache_key"): "made of a volume",
     ("PrecomputedGradient", "gradients"): "made of a volume",
     ("Volume", "values"): "voxels of any type, checked on their own",
     ("Volume", "world_from_grid"): "an affine transform, checked on its own",
@@ -271,6 +277,7 @@ PLACES = {
     "AbstractBRDF": "material",
     "AbstractTransfer": "transfer",
     "AbstractRadianceTransfer": "radiance_transfer",
+    "AbstractOcclusion": "occlusion",
 }
 
 
@@ -379,7 +386,7 @@ def data_with(place: str, table: dict[str, Any]) -> dict[str, Any]:
     data: dict[str, Any] = {
         "volume": {"builtin": "demo"},
         "transfer": {"kind": "window"},
-        "lights": [{"kind": "directional", "direction": [0, 0, 1]}],
+        "lights": [{"kind": "directional", "direction": [0, 0, 1]}, {"kind": "ambient"}],
         "shading": {"kind": "lambert"},
         "environment": "constant",
         "material": "lambert",
