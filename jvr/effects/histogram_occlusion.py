@@ -137,7 +137,7 @@ class HistogramOcclusion(AbstractOcclusion):
             clipping=scene.clipping,
             medium=medium,
             reach=Reach.of(self, scene.volume),
-            positions=_positions(self.bins, scene.volume),
+            scalars=_positions(self.bins, scene.volume),
             rays=self.rays,
             resolution=self.resolution,
         )
@@ -169,13 +169,13 @@ class HistogramOcclusion(AbstractOcclusion):
 
 
 class HistogramProjection(AbstractProjection):
-    """All that the histograms of a scene are made with, `rays` rays from each node. `positions`: scalars of the bins."""
+    """All that the histograms of a scene are made with, `rays` rays from each node. `scalars`: of the bins."""
 
     volume: Volume
     clipping: ClippingBox | None
     medium: Medium
     reach: Reach
-    positions: Float[Array, "bins"]
+    scalars: Float[Array, "bins"]
     rays: int = eqx.field(static=True)
     resolution: float = eqx.field(static=True)
 
@@ -185,9 +185,9 @@ class HistogramProjection(AbstractProjection):
 
     def project(self, p: Float[Array, "nodes 3"]) -> tuple[Float[Array, "nodes bins"]]:
         """Histograms around grid positions."""
-        rays, bins = short_rays(self.volume, self.clipping, self.rays, p), self.positions.shape[0]
+        rays, bins = short_rays(self.volume, self.clipping, self.rays, p), self.scalars.shape[0]
         ends = self.reach.ends
-        first, last = self.positions[0], self.positions[-1]
+        first, last = self.scalars[0], self.scalars[-1]
         node = jnp.repeat(jnp.arange(p.shape[0]), self.rays)
 
         def step(total: Float[Array, "nodes bins"], ends: tuple[Scalar, Scalar]) -> tuple[Float[Array, "nodes bins"], None]:
@@ -204,7 +204,7 @@ class HistogramProjection(AbstractProjection):
             total = total.at[node, index].add(share * (1 - fraction)).at[node, index + 1].add(share * fraction)
             return total, None
 
-        zero = jnp.zeros((p.shape[0], bins), self.positions.dtype)
+        zero = jnp.zeros((p.shape[0], bins), self.scalars.dtype)
         total, _ = jax.lax.scan(jax.checkpoint(step), zero, (ends[:-1], ends[1:]))
         return (total * (1 - self.reach.beyond) / (self.rays * (ends.shape[0] - 1)),)
 

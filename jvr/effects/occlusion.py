@@ -174,6 +174,26 @@ def occlusion_visibility(occlusion: Any, volume: Volume, taken: Float[Array, "x 
     return OcclusionVisibility(Grid.of(left), nodes_for_each_voxel(volume, (x, y, z)))
 
 
+class Reach(eqx.Module):
+    """How far rays go. `ends`: of their segments, distances from where they begin, all the same where there is nothing between `offset` and
+    `radius` of an occlusion; `length`: from the one to the other; `beyond`: the fraction of it that lies behind the last segment, out of
+    the volume, which no ray is longer than."""
+
+    ends: Float[Array, "ends"]
+    length: Scalar
+    beyond: Scalar
+
+    @classmethod
+    def of(cls, occlusion: Any, volume: Volume) -> "Reach":
+        spacing = jnp.min(volume.spacing)
+        offset = OFFSET * spacing if occlusion.offset is None else occlusion.offset
+        radius = RADIUS * spacing if occlusion.radius is None else occlusion.radius
+        length = larger(radius - offset, 0.0)
+        inside = clamp(2 * volume.radius - offset, jnp.zeros_like(length), length)
+        ends = offset + inside * jnp.linspace(0.0, 1.0, occlusion.samples + 1, dtype=spacing.dtype)
+        return cls(ends, length, divide_or_zero(length - inside, length))
+
+
 class OcclusionProjection(AbstractProjection):
     """All that the nodes of a scene are computed with, `rays` rays from each."""
 
@@ -199,26 +219,6 @@ class OcclusionProjection(AbstractProjection):
             return 1 - jnp.stack([jnp.mean(mean.reshape(p.shape[0], -1), axis=1) for mean in means], axis=-1)
 
         return (taken(self, p),)
-
-
-class Reach(eqx.Module):
-    """How far rays go. `ends`: of their segments, distances from where they begin, all the same where there is nothing between `offset` and
-    `radius` of an occlusion; `length`: from the one to the other; `beyond`: the fraction of it that lies behind the last segment, out of
-    the volume, which no ray is longer than."""
-
-    ends: Float[Array, "ends"]
-    length: Scalar
-    beyond: Scalar
-
-    @classmethod
-    def of(cls, occlusion: Any, volume: Volume) -> "Reach":
-        spacing = jnp.min(volume.spacing)
-        offset = OFFSET * spacing if occlusion.offset is None else occlusion.offset
-        radius = RADIUS * spacing if occlusion.radius is None else occlusion.radius
-        length = larger(radius - offset, 0.0)
-        inside = clamp(2 * volume.radius - offset, jnp.zeros_like(length), length)
-        ends = offset + inside * jnp.linspace(0.0, 1.0, occlusion.samples + 1, dtype=spacing.dtype)
-        return cls(ends, length, divide_or_zero(length - inside, length))
 
 
 def short_rays(volume: Volume, clipping: ClippingBox | None, number: int, p: Float[Array, "nodes 3"]) -> SecondaryRays:
