@@ -23,11 +23,14 @@ from jvr.model.parts import Knob, multiples
 from jvr.model.ranges import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL, Interval
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.numerics import mean_transmittance
+from jvr.numerics import divide_or_zero, mean_transmittance
 from jvr.types import ArrayLike, Scalar
 
-# Scalars at which the transfer function is looked at in each bin.
+# Scalars at which the transfer function is looked at on either side of each bin.
 LOOKS = 8
+# Size of a grain where a scene says none, in voxels of the smallest spacing: that of the least error on the scenes of
+# `experiments/occlusion_accuracy.py`.
+GRAIN = 2.0
 
 
 class LocalHistograms(eqx.Module):
@@ -53,21 +56,23 @@ class HistogramOcclusion(AbstractOcclusion):
     """Dynamic ambient occlusion: as `jvr.LocalOcclusion`, from the histogram of the scalars in a ball around a point, whatever the transfer
     function makes of them.
 
-        I(x) = 1 - sum_k H_k(x) alpha_k,        alpha_k = 1 - phi1(sigma_t(s_k) (R - a)),    phi1(d) = (1 - exp(-d)) / d,
+        I(x) = phi1((R - a) sum_k H_k(x) rho_k),    rho_k = (1 - exp(-sigma_t(s_k) g)) / g,    phi1(d) = (1 - exp(-d)) / d,
 
-    as if each ray met one scalar `s_k` of the histogram `H(x)` all along its way: exact where the ball is homogeneous, and where parts of
-    it are opaque and others empty by solid angles. What is behind something counts as if it stood free, and a thin opaque sheet as little
-    as it is thick: the less extinction varies along a ray the better. Ambient light is multiplied with `(bias + (1 - bias) I)^gamma`.
+    the mean transmittance of a ball in which grains of `g` across lie at random, each with one scalar `s_k` of the histogram `H(x)`: exact
+    where the ball is homogeneous and not opaque within a grain. What stands in front of what histograms do not know: the wall of a large
+    opaque body shades more than it should, and a sheet that is thinner than a grain as well. Ambient light is multiplied with
+    `(bias + (1 - bias) I)^gamma`.
 
-    With a `bleeding` the medium that is near sends on a part of the light that it takes, in its own colour:
-    `I = 1 - sum_k H_k alpha_k (1 - bleeding rgb_k)` in each colour.
+    With a `bleeding` the medium that is near sends on a part of the light that it takes, in its own colour, the mean of `rgb_k` with the
+    weights `H_k rho_k`: `I + bleeding (1 - I) rgb` in each colour.
 
     **Arguments:** `bins`: of a histogram, equally spaced between the least and the largest voxel, at least 2; `rays`, `radius`, `offset`,
-    `samples`, `resolution`, `bias`, `gamma`: as of `jvr.LocalOcclusion`; `bleeding`: 0 ... 1, or `None`.
+    `samples`, `resolution`, `bias`, `gamma`: as of `jvr.LocalOcclusion`; `grain`: `g`, a world length, by default twice the smallest
+    spacing; `bleeding`: 0 ... 1, or `None`.
 
-    Differentiable in transfer function, `bias`, `gamma` and `bleeding`, and where histograms are not computed beforehand in voxels,
-    `radius` and `offset`; detached: where bins lie. `jvr.precompute(scene)` keeps them: they are those of volume and clipping box, and a
-    new transfer function costs a product of a matrix and a vector, `bins` numbers for each node. **Raises** `ValueError` for numbers
+    Differentiable in transfer function, `bias`, `gamma`, `grain` and `bleeding`, and where histograms are not computed beforehand in
+    voxels, `radius` and `offset`; detached: where bins lie. `jvr.precompute(scene)` keeps them: they are those of volume and clipping box,
+    and a new transfer function costs a product of a matrix and a vector, `bins` numbers for each node. **Raises** `ValueError` for numbers
     outside their ranges, and for a transfer function that takes the gradient, of which histograms know nothing.
     """
 
@@ -78,7 +83,8 @@ class HistogramOcclusion(AbstractOcclusion):
     samples: int = choice(AT_LEAST_ONE, doc="along each ray")
     resolution: float = choice(Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start")
     bias: Scalar = parameter(UNIT_INTERVAL, doc="share of ambient light that nothing takes away")
-    gamma: Scalar = parameter(POSITIVE, doc="exponent of what is left of ambient light")
+    gamma: Scalar | None = parameter(POSITIVE, doc="exponent of what is left of ambient light")
+    grain: Scalar | None = parameter(POSITIVE, doc="size of what is opaque", unit="mm")
     bleeding: Scalar | None = parameter(UNIT_INTERVAL, doc="share of the light that what is near sends on")
     projected: LocalHistograms | None = parameter(doc="what has been computed beforehand")
 
@@ -92,11 +98,12 @@ class HistogramOcclusion(AbstractOcclusion):
         samples: int = 16,
         resolution: float | int = 0.5,
         bias: ArrayLike = 0.0,
-        gamma: ArrayLike = 1.0,
+        gamma: ArrayLike | None = None,
+        grain: ArrayLike | None = None,
         bleeding: ArrayLike | None = None,
     ):
         assign(self, bins=bins, rays=rays, radius=radius, offset=offset, samples=samples, resolution=resolution)
-        assign(self, bias=bias, gamma=gamma, bleeding=bleeding)
+        assign(self, bias=bias, gamma=gamma, grain=grain, bleeding=bleeding)
         self.projected = None
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
@@ -159,13 +166,20 @@ class HistogramOcclusion(AbstractOcclusion):
         # Each bin as its own hat sees the transfer function.
         positions, at = histograms.positions, (jnp.arange(2 * LOOKS + 1, dtype=histograms.positions.dtype) - LOOKS) / (LOOKS + 1)
         hat = (1 - jnp.abs(at)) / jnp.sum(1 - jnp.abs(at))
-        scalars = positions[:, None] + at * (positions[1] - positions[0])
-        rgb, sigma_t = jax.vmap(jax.vmap(scene.transfer.evaluate))(jnp.clip(scalars, positions[0], positions[-1]))
-        densest = DENSEST / jnp.min(scene.volume.spacing)
-        alpha = [1 - mean_transmittance(jnp.minimum(sigma, densest) * histograms.length) for sigma in sigma_t]
+        scalars = jnp.clip(positions[:, None] + at * (positions[1] - positions[0]), positions[0], positions[-1])
+        rgb, sigma_t = jax.vmap(jax.vmap(scene.transfer.evaluate))(scalars)
+        grain = GRAIN * jnp.min(scene.volume.spacing) if self.grain is None else self.grain
+        # The mean extinction of a grain: so much of it as it takes of what goes through it.
+        rho = [sigma * mean_transmittance(sigma * grain) for sigma in (jnp.minimum(s, DENSEST / grain) for s in sigma_t)]
+        channels = [r @ hat for r in rho]
+        coloured = [] if self.bleeding is None else [(r * c) @ hat for r, c in zip(rho * (3 // len(rho)), rgb, strict=True)]
+        found = jnp.moveaxis(histograms.weights @ jnp.stack(channels + coloured, axis=-1), -1, 0)
+        extinction = list(found[: len(channels)])
+        taken = [1 - mean_transmittance(histograms.length * mean) for mean in extinction]
         if self.bleeding is not None:
-            alpha = [a * (1 - self.bleeding * c) for a, c in zip(alpha * (3 // len(alpha)), rgb, strict=True)]
-        return histograms.weights @ jnp.stack([a @ hat for a in alpha], axis=-1)
+            colours = zip(taken * (3 // len(taken)), extinction * (3 // len(extinction)), found[len(channels) :], strict=True)
+            taken = [t * (1 - self.bleeding * divide_or_zero(c, mean)) for t, mean, c in colours]
+        return jnp.stack(taken, axis=-1)
 
 
 class HistogramProjection(AbstractProjection):

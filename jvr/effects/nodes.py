@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -25,6 +25,8 @@ class AbstractProjection(eqx.Module):
 
     volume: eqx.AbstractVar[Volume]
     medium: eqx.AbstractVar[Medium]
+    # How many nodes away a visible point may be that makes a node worth it.
+    reach_of_nodes: ClassVar[int] = 1
 
     @property
     @abc.abstractmethod
@@ -48,14 +50,14 @@ class AbstractProjection(eqx.Module):
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: index.shape[0]], found)
 
     def active(self) -> Bool[Array, "nodes"]:
-        """Nodes with something visible no further away than the next node."""
+        """Nodes with something visible no further away than so many nodes."""
         p, occupancy = jnp.asarray(self.positions), self.medium.occupancy
         if occupancy is None:
             return jnp.ones(p.shape[0], bool)
         bricks = occupancy.empty_radius.shape
         b = [jnp.clip((p[:, i] / occupancy.size).astype(jnp.int32), 0, n - 1) for i, n in enumerate(bricks)]
         near = max((n - 1) / max(m - 1, 1) for n, m in zip(self.volume.shape, self.shape, strict=True))
-        return occupancy.empty_radius[b[0], b[1], b[2]] <= math.ceil(near / occupancy.size)
+        return occupancy.empty_radius[b[0], b[1], b[2]] <= math.ceil(self.reach_of_nodes * near / occupancy.size)
 
     def all_nodes(self) -> tuple[Array, ...]:
         """`project_all` of those that are active."""

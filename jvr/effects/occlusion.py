@@ -5,7 +5,7 @@ section 6.1).
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from jvr.march.secondary import SecondaryRays, channel_count, secondary_rays, ta
 from jvr.march.steps import Point, Transmittances
 from jvr.model.clipping import ClippingBox
 from jvr.model.effects import AbstractOcclusion, stale_message
-from jvr.model.grids import Shape, node_shape, nodes_for_each_voxel
+from jvr.model.grids import Shape, node_shape, nodes_for_each_voxel, resampled_cubic
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import Knob, multiples
 from jvr.model.ranges import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL, Interval
@@ -45,8 +45,9 @@ class LocalOcclusion(AbstractOcclusion):
     is 1 where nothing is near and `bias^gamma` where everything is opaque (equation 6.4 has `(bias + I)^gamma`, which exceeds 1).
     Coloured extinction has an `I` for each channel. Where the volume or its clipping box ends there is nothing more.
 
-    `I` is found at the nodes of a grid near which something is visible, and is trilinear in between. Along a ray extinction is constant
-    in each of `samples` segments, whose integral is exact: what is homogeneous has no error of the quadrature.
+    `I` is found at the nodes of a grid near which something is visible, by cubic convolution at the voxels, and is trilinear in between.
+    Along a ray extinction is constant in each of `samples` segments, whose integral is exact: what is homogeneous has no error of the
+    quadrature.
 
     **Arguments:**
 
@@ -55,7 +56,7 @@ class LocalOcclusion(AbstractOcclusion):
       than `offset` nothing is occluded, which is the limit of ever smaller balls.
     - `samples`: segments along each ray.
     - `resolution`: nodes for each voxel along an axis, above 0 and at most 1.
-    - `bias`: 0 ... 1; `gamma`: positive.
+    - `bias`: 0 ... 1; `gamma`: positive, or `None` for 1.
 
     Differentiable in transfer function, voxels, `radius`, `offset`, `bias` and `gamma` while it is not computed beforehand; then each
     picture does it anew. `jvr.precompute(scene)` does it once and keeps `I`, which is then a constant: `bias`, `gamma`, camera and lights
@@ -69,7 +70,7 @@ class LocalOcclusion(AbstractOcclusion):
     samples: int = choice(AT_LEAST_ONE, doc="segments along each ray")
     resolution: float = choice(Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start")
     bias: Scalar = parameter(UNIT_INTERVAL, doc="share of ambient light that nothing takes away")
-    gamma: Scalar = parameter(POSITIVE, doc="exponent of what is left of ambient light")
+    gamma: Scalar | None = parameter(POSITIVE, doc="exponent of what is left of ambient light")
     projected: "ProjectedOcclusion | None" = parameter(doc="what has been computed beforehand")
 
     def __init__(
@@ -81,7 +82,7 @@ class LocalOcclusion(AbstractOcclusion):
         samples: int = 16,
         resolution: float | int = 0.5,
         bias: ArrayLike = 0.0,
-        gamma: ArrayLike = 1.0,
+        gamma: ArrayLike | None = None,
     ):
         assign(self, rays=rays, radius=radius, offset=offset, samples=samples, resolution=resolution, bias=bias, gamma=gamma)
         self.projected = None
@@ -125,21 +126,22 @@ class LocalOcclusion(AbstractOcclusion):
         )
 
     def finished(self, scene: Scene, *nodes: Any) -> "ProjectedOcclusion":
-        (taken,) = nodes
-        taken = taken.reshape(*node_shape(scene.volume, self.resolution), -1)
-        return ProjectedOcclusion(taken, jnp.asarray(self.cache_key(scene)))
+        return ProjectedOcclusion(self._taken(scene.volume, *nodes), jnp.asarray(self.cache_key(scene)))
 
     def visibility(self, scene: Scene, path: LightPath) -> "OcclusionVisibility":
-        if self.projected is None:
-            (taken,) = _all_nodes(self.projection(scene, path))
-            taken = taken.reshape(*node_shape(scene.volume, self.resolution), -1)
-        else:
-            taken = self.projected.taken
+        kept = self.projected
+        taken = self._taken(scene.volume, *_all_nodes(self.projection(scene, path))) if kept is None else kept.taken
         return occlusion_visibility(self, scene.volume, taken)
+
+    def _taken(self, volume: Volume, nodes: Float[Array, "nodes channels"]) -> Float[Array, "x y z channels"]:
+        """What all nodes take of ambient light, on the grid of the voxels: straight lines between nodes would let light into whatever is
+        not much thicker than they are apart."""
+        coarse = nodes.reshape(*node_shape(volume, self.resolution), -1)
+        return jnp.clip(resampled_cubic(coarse, volume.shape), 0.0, 1.0)
 
 
 class ProjectedOcclusion(eqx.Module):
-    """Occlusion as it was computed.
+    """Occlusion as it was computed, on the grid of the voxels.
 
     - `taken`: `(x, y, z, 1)`, or `(x, y, z, 3)` for coloured extinction: `1 - I`, which is also 0 where nothing is visible and nothing was
       computed.
@@ -153,14 +155,17 @@ class ProjectedOcclusion(eqx.Module):
 
 
 class OcclusionVisibility(AbstractVisibility):
-    """What arrives of ambient light, known at the nodes of a grid."""
+    """What arrives of ambient light, `(bias + (1 - bias) I)^gamma`. `grid`: nodes that hold `1 - I`."""
 
     grid: Grid
+    bias: Scalar
+    gamma: Scalar | None
     scale: tuple[float, float, float] = eqx.field(static=True)
 
     def transmittances(self, points: Point, wanted: Any, *, reverse: bool) -> Transmittances:
         at = tuple(c * f for c, f in zip(points.p, self.scale, strict=True))
-        return Transmittances(ambient=self.grid.interpolate(at, wanted))
+        left = (1 - (1 - self.bias) * taken for taken in self.grid.interpolate(at, wanted))
+        return Transmittances(ambient=tuple(x if self.gamma is None else jnp.power(x, self.gamma) for x in left))
 
     @property
     def stats(self) -> None:
@@ -168,10 +173,9 @@ class OcclusionVisibility(AbstractVisibility):
 
 
 def occlusion_visibility(occlusion: Any, volume: Volume, taken: Float[Array, "x y z channels"]) -> OcclusionVisibility:
-    """What nodes leave of ambient light that take away so much of it, by the `bias` and `gamma` of an occlusion."""
-    left = jnp.power(occlusion.bias + (1 - occlusion.bias) * (1 - taken), occlusion.gamma)
+    """Where nodes take so much of ambient light, what is left of it by the `bias` and `gamma` of an occlusion."""
     x, y, z = taken.shape[:3]
-    return OcclusionVisibility(Grid.of(left), nodes_for_each_voxel(volume, (x, y, z)))
+    return OcclusionVisibility(Grid.of(taken), occlusion.bias, occlusion.gamma, nodes_for_each_voxel(volume, (x, y, z)))
 
 
 class Reach(eqx.Module):
@@ -196,6 +200,9 @@ class Reach(eqx.Module):
 
 class OcclusionProjection(AbstractProjection):
     """All that the nodes of a scene are computed with, `rays` rays from each."""
+
+    # As far as a cubic convolution reads.
+    reach_of_nodes: ClassVar[int] = 2
 
     volume: Volume
     clipping: ClippingBox | None
