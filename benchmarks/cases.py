@@ -22,6 +22,7 @@ from benchmarks.light import light
 from benchmarks.poses import pose_step
 from benchmarks.preparation import preparation
 from benchmarks.timing import median, ratio, seconds
+from benchmarks.voxels import voxel_step
 from jvr.march.march import MarchOptions, march
 from jvr.rendering.medium import Prepared, medium
 from jvr.rendering.trace import enter, step_length
@@ -176,8 +177,8 @@ def _measured(function: str, *arguments: str | int) -> str:
 
 
 def fitting() -> dict[str, Any]:
-    """The CT head protocol (docs/fitting.md): time to 60 dB in evaluations of a plain forward march over the same kept samples, and a step
-    of all poses of its views in pictures of these."""
+    """The CT head protocol (docs/fitting.md): time to 60 dB in evaluations of a plain forward march over the same kept samples, a step of
+    all poses of its views in pictures of these, and an evaluation of voxels (`experiments/tomography.py`) likewise."""
     from experiments.protocols import ct_head
     from jvr.fitting.observations import inside, keep_samples, observe, observed_medium, prepare_in_fit
 
@@ -221,6 +222,7 @@ def fitting() -> dict[str, Any]:
         "kept_bytes": result.stats.kept_bytes,
         "negligible": less,
         "poses": pose_step(protocol.truth, cameras, images, settings, repeats=5),
+        "voxels": voxel_step(),
     }
 
 

@@ -39,7 +39,7 @@ class Subject(NamedTuple):
     factors."""
 
     name: str
-    scene: jvr.Scene
+    scene: Any
     camera: jvr.PerspectiveCamera
     points: np.ndarray
     seen: int
@@ -63,7 +63,7 @@ def subjects(quick: bool) -> list[Subject]:
     return [_subject(name, *scene, count, rays) for name, scene in scenes.items()]
 
 
-def _subject(name: str, volume: jvr.Volume, transfer: jvr.LinearTransfer, count: int, rays: int) -> Subject:
+def _subject(name: str, volume: jvr.Volume, transfer: Any, count: int, rays: int) -> Subject:
     center, away = np.asarray(volume.center), 3.5 * float(volume.radius)
     eye = center + away * np.array([0.5, -0.8, 0.33])
     camera = jvr.PerspectiveCamera.look_at(eye, center, [0, 0, 1], 34.0, 128, 128)
@@ -84,7 +84,7 @@ def _subject(name: str, volume: jvr.Volume, transfer: jvr.LinearTransfer, count:
     return Subject(name, scene, camera, where, len(seen), brute_force(scene, where, rays))
 
 
-def brute_force(scene: jvr.Scene, where: np.ndarray, rays: int) -> np.ndarray:
+def brute_force(scene: Any, where: np.ndarray, rays: int) -> np.ndarray:
     """Factors at grid positions, without jvr."""
     volume, transfer = scene.volume, scene.transfer
     values, matrix = np.asarray(volume.values, np.float64), np.asarray(volume.world_from_grid, np.float64)
@@ -125,14 +125,14 @@ def measured(subject: Subject, quick: bool) -> dict[str, Any]:
     for method, knob, occlusion in methods(quick):
         scene = dataclasses.replace(subject.scene, occlusion=occlusion)
         kept = jvr.precompute(scene)
-        projection = _least(lambda scene=scene: jvr.precompute(scene).occlusion.projected, repeats=2)
+        projection = _least(lambda scene=scene: jax.tree.leaves(jvr.precompute(scene)), repeats=2)
         found = np.asarray(_factors(kept, at), np.float64)
         row = {"method": method, "knob": knob, "projection_seconds": projection}
         row["picture"] = _least(lambda kept=kept: drawn(kept)) / plain
         for name, part in (("seen", slice(0, subject.seen)), ("matter", slice(subject.seen, None))):
             error = found[part] - subject.truth[part]
             row |= {f"rmse_{name}": float(np.sqrt(np.mean(error**2))), f"largest_{name}": float(np.abs(error).max())}
-            row[f"rank_correlation_{name}"] = float(spearmanr(found[part], subject.truth[part])[0])
+            row[f"rank_correlation_{name}"] = float(np.asarray(spearmanr(found[part], subject.truth[part])[0]))
         if method == "histogram":
             row["transfer_seconds"] = _least(lambda kept=kept: jax.block_until_ready(_visibility(kept)))
         rows.append(row)
@@ -147,13 +147,13 @@ def _parts(subject: Subject) -> dict[str, slice]:
 
 @jax.jit
 def _visibility(scene: jvr.Scene) -> Any:
+    assert scene.occlusion is not None
     return scene.occlusion.visibility(scene, lambda graded: absorbing(scene, None, graded))
 
 
 @jax.jit
 def _factors(scene: jvr.Scene, at: Any) -> Any:
-    visibility = scene.occlusion.visibility(scene, lambda graded: absorbing(scene, None, graded))
-    return visibility.transmittances(at, jnp.ones(at.p[0].shape, bool), reverse=False).ambient[0]
+    return _visibility(scene).transmittances(at, jnp.ones(at.p[0].shape, bool), reverse=False).ambient[0]
 
 
 def _least(work: Callable[[], Any], repeats: int = 5) -> float:

@@ -187,12 +187,13 @@ def run(case: Case) -> dict[str, Any]:
     began = time.perf_counter()
     result = jvr.fit(case.start, cameras, images, unknowns=case.unknowns, settings=case.settings, progress=False)
     seconds = time.perf_counter() - began
-    found, true, errors = (
+    found, true, errors, determined = (
         np.concatenate([np.ravel(x).astype(float) for x in jax.tree.leaves(tree)])
-        for tree in (case.unknowns(result.scene), case.unknowns(case.truth), result.standard_errors)
+        for tree in (case.unknowns(result.scene), case.unknowns(case.truth), result.standard_errors, result.determined)
     )
-    voxel, known = float(jnp.min(case.truth.volume.spacing)), np.isfinite(errors)
-    of_extinction = np.isfinite(np.asarray(result.errors_by_name["transfer.sigma_t"]))
+    voxel, known = float(jnp.min(case.truth.volume.spacing)), determined > 0
+    names = dict(zip(result.unknowns, jax.tree.leaves(result.determined), strict=True))
+    of_extinction = np.asarray(names["transfer.sigma_t"])
     opacity = lambda scene: -np.expm1(-voxel * np.asarray(scene.transfer.sigma_t, float))[of_extinction]
     return {
         "known_psnr": float(psnr(case.truth)),

@@ -205,6 +205,8 @@ def absorption(size: int, numbers: tuple[int, ...], steps: int) -> tuple[list[Ro
             rows.append(Row("Adam, as long", views, curve[at][1], curve[at][0], at + 1))
             note("Adam, three times as long", found, curve[-1][0], len(curve))
         slices[views] = {name: found[..., size // 2] for name, found in shown.items()}
+        # The programs of all fits together exceed what a process may map into memory.
+        jax.clear_caches()
     return rows, slices, curve
 
 
@@ -251,6 +253,7 @@ def coloured(size: int, views: int, width: int, steps: int) -> tuple[list[Row], 
         rows.append(Row(name, views, psnr(found, wanted), seconds, len(result.history), float(-10 * np.log10(error))))
         print(f"colours, {name}: {rows[-1].voxels:.2f} dB, picture {rows[-1].held_out:.2f} dB", file=sys.stderr, flush=True)
         slices[name] = found[..., size // 2]
+        jax.clear_caches()
     return rows, pictures, slices
 
 

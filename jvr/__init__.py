@@ -84,6 +84,8 @@ if TYPE_CHECKING:
     from jvr.model.clipping import ClippingBox as ClippingBox
     from jvr.model.dipole import Dipole as Dipole
     from jvr.model.environment import EnvironmentLight as EnvironmentLight
+    from jvr.model.environment_map import EnvironmentMap as EnvironmentMap
+    from jvr.model.geometry import DepthImage as DepthImage
     from jvr.model.gradient_transfer import GradientOpacity as GradientOpacity
     from jvr.model.gradient_transfer import GradientTransfer as GradientTransfer
     from jvr.model.interpolation import Nearest as Nearest

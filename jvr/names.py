@@ -73,6 +73,8 @@ NAMES = {
     "jvr.model.clipping": ("ClippingBox",),
     "jvr.model.dipole": ("Dipole",),
     "jvr.model.environment": ("EnvironmentLight",),
+    "jvr.model.environment_map": ("EnvironmentMap",),
+    "jvr.model.geometry": ("DepthImage",),
     "jvr.model.gradient_transfer": ("GradientOpacity", "GradientTransfer"),
     "jvr.model.interpolation": ("Nearest", "Trilinear"),
     "jvr.model.light": ("AmbientLight", "DirectionalLight", "HeadLight", "PointLight", "SpotLight", "disc_light", "sphere_light"),

@@ -31,6 +31,8 @@ from jvr.march.quadrature import AbstractQuadrature
 from jvr.model.camera import AbstractCamera
 from jvr.model.effects import AbstractOcclusion, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
+from jvr.model.environment_map import EnvironmentMap
+from jvr.model.geometry import AbstractGeometry
 from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
@@ -106,7 +108,13 @@ def pages_with(found: list[pages.Block], *slow: str) -> list:
 @pytest.mark.parametrize(
     "page",
     pages_with(
-        pages.blocks("python"), "README.md", "docs/environment_lighting.md", "docs/fitting.md", "docs/light.md", "docs/voxels.md"
+        pages.blocks("python"),
+        "README.md",
+        "docs/environment_lighting.md",
+        "docs/fitting.md",
+        "docs/light.md",
+        "docs/surfaces.md",
+        "docs/voxels.md",
     ),
 )
 def test_code_runs(page, desk):
@@ -172,6 +180,8 @@ FAMILIES = {
     "[scattering.phase]": AbstractPhase,
     "[normals]": AbstractNormals,
     "[material]": AbstractBRDF,
+    "[background]": EnvironmentMap,
+    "[geometry]": AbstractGeometry,
     "[environment]": EnvironmentLight,
     "[camera]": AbstractCamera,
     "[settings.quadrature]": AbstractQuadrature,

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 
 import jvr
-from experiments import contact_sheet, convergence, occlusion_accuracy, other_renderers, phase_recovery, relight, shadowed_fit
+from experiments import (
+    contact_sheet,
+    convergence,
+    occlusion_accuracy,
+    other_renderers,
+    phase_recovery,
+    pose_recovery,
+    relight,
+    shadowed_fit,
+    tomography,
+)
 from jvr.io.config import build_fit, build_scene, read_config
 
 
@@ -186,3 +196,17 @@ def test_pictures_of_other_renderers_are_explained(monkeypatch, tmp_path):
     assert shaded["held_out_psnr"] > 35
     assert plain["opacity_rmse"] < 0.06
     assert all(row["outcome"] == "CONVERGED" for row in found.values())
+
+
+@pytest.mark.slow
+def test_poses_are_recovered(monkeypatch, tmp_path):
+    result, size = ran(pose_recovery, monkeypatch, tmp_path)
+    assert size > 1000
+    print(result)
+
+
+@pytest.mark.slow
+def test_voxels_are_found_beside_other_methods(monkeypatch, tmp_path):
+    result, size = ran(tomography, monkeypatch, tmp_path)
+    assert size > 1000
+    print(result)

@@ -37,6 +37,7 @@ ORDER = (
 READERS = {
     ("jvr.model.merl", "jvr.io.merl"),
     ("jvr.model.environment", "jvr.io.environment"),
+    ("jvr.model.geometry", "jvr.io.geometry"),
 }
 HEAVY = (
     "optimistix",

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jvr.numerics import clamp, materialise, read_at
+from jvr.numerics import clamp, materialise
 from jvr.types import Channels, Triple
 
 
@@ -31,15 +31,10 @@ class Grid(eqx.Module):
         low = [jnp.clip(jnp.floor(c), 0, max(n - 1, 0)) for c, n in zip(at, self.cells, strict=True)]
         i, j, k = (c.astype(jnp.int32) for c in low)
         first, (x, y, z) = materialise(wanted, ((i * ny + j) * nz + k, [c - b for c, b in zip(at, low, strict=True)]))
-        corners = [
-            ((a * ny + b) * nz + c, (x if a else 1 - x) * (y if b else 1 - y) * (z if c else 1 - z))
-            for a, b, c in itertools.product(*[range(min(n, 1) + 1) for n in self.cells])
-        ]
-        if self.rows.shape[1] == 1:
-            flat = self.rows.reshape(-1)
-            return (materialise(wanted, sum(weight * read_at(flat, first + ahead) for ahead, weight in corners)),)
         total = jnp.zeros((wanted.shape[0], self.rows.shape[1]), self.rows.dtype)
-        for ahead, weight in corners:
-            total += weight[:, None] * self.rows.at[first + ahead].get(mode="promise_in_bounds")
+        for a, b, c in itertools.product(*[range(min(n, 1) + 1) for n in self.cells]):
+            row = self.rows.at[first + (a * ny + b) * nz + c].get(mode="promise_in_bounds")
+            weight = (x if a else 1 - x) * (y if b else 1 - y) * (z if c else 1 - z)
+            total += weight[:, None] * row
         total = materialise(wanted, total)
         return tuple(total[:, i] for i in range(total.shape[1]))

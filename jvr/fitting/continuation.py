@@ -49,6 +49,11 @@ class _Roughness(NamedTuple):
     upper: Values
 
 
+def are_determined(problem: Problem, values: Values, errors: Values) -> Bool[np.ndarray, "unknowns"]:
+    """Which values have a standard error well below how large they may plausibly be."""
+    return errors <= UNDETERMINED * problem.unknowns.plausible(problem.model, values)
+
+
 def continued(
     problem: Problem, values: Values, errors: Values, around: Quadratic, objective: Callable[[Values], float]
 ) -> tuple[Values, Bool[np.ndarray, "unknowns"]]:
@@ -71,7 +76,7 @@ def continued(
 
 def _roughness(problem: Problem, values: Values, errors: Values) -> _Roughness:
     unknowns, model, begin = problem.unknowns, problem.model, 0
-    plausible = unknowns.plausible(model, values)
+    plausible, determined = unknowns.plausible(model, values), are_determined(problem, values, errors)
     free, lower, upper = np.zeros(values.size, bool), np.full(values.size, -np.inf), np.full(values.size, np.inf)
     rows = []
     for i, array in enumerate(unknowns.values(model)):
@@ -82,7 +87,7 @@ def _roughness(problem: Problem, values: Values, errors: Values) -> _Roughness:
             continue
         lower[place], upper[place] = declared.low, declared.high
         for column in place.reshape(len(place), -1).T:
-            loose = errors[column] > UNDETERMINED * plausible[column]
+            loose = ~determined[column]
             if loose.all() or not loose.any():
                 continue
             free[column] = loose

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jvr.fitting import coarse
 from jvr.fitting.bijectors import Bounded
 from jvr.fitting.checkpoint import fingerprint
-from jvr.fitting.continuation import continued
+from jvr.fitting.continuation import are_determined, continued
 from jvr.fitting.descent import Checkpoint, Descent
 from jvr.fitting.evaluator import Evaluator
 from jvr.fitting.groups import Group, Lights, groups_of, lights_of, lit
@@ -26,7 +26,7 @@ from jvr.fitting.least_squares import ChunkedLeastSquares, LevenbergMarquardt
 from jvr.fitting.losses import DSSIM, AbstractLoss, AbstractPrior, SquaredError
 from jvr.fitting.minimisers import OptimistixSolver
 from jvr.fitting.objective import check_derivatives
-from jvr.fitting.observations import check_settings, is_mostly_empty
+from jvr.fitting.observations import check_settings, check_views, is_mostly_empty
 from jvr.fitting.problem import Problem
 from jvr.fitting.reach import known_background, say_what_is_out_of_reach
 from jvr.fitting.result import FitResult, FitStats, Iteration
@@ -128,6 +128,7 @@ def fit(
     targets, weights = given = targets_of(cameras, images, weights, behind)
     lights = lights_of(lights, cameras)
     held = None if held_out is None else _held_out(held_out, behind)
+    check_views(scene, (*views, *(() if held is None else held[0])))
     start = chosen.model_from_unconstrained(model, chosen.unconstrained_from_model(model))
     problem = Problem(model, chosen, settings, loss, tuple(priors), None, is_mostly_empty(start.scene, settings))
     forwards = _check(problem, solver, given, coarse_levels)
@@ -158,14 +159,17 @@ def fit(
     evaluator.settle(problem)
     # The problem of the first group has its lights.
     model = problem.model if lights is None else model
-    known, quiet = undetermined(values.size), np.zeros(values.size, bool)
+    known, quiet, determined = undetermined(values.size), np.zeros(values.size, bool), np.zeros(0, bool)
     if march_unknowns(problem) <= MOST_FORWARD:
         known, around = evaluator.solution(values)
+        determined = are_determined(problem, np.asarray(values, np.float64), known.standard_errors)
         if smooth_undetermined:
             moved, quiet = continued(problem, np.asarray(values, np.float64), known.standard_errors, around, evaluator.objective)
             values = jnp.asarray(moved, values.dtype)
     found = chosen.insert(model, chosen.split(values, model))
     errors = chosen.split(jnp.asarray(known.standard_errors), model)
+    marks = np.split(determined, np.cumsum([error.size for error in errors])[:-1])
+    marks = [mark.reshape(error.shape) for mark, error in zip(marks, errors, strict=True)] if determined.size else []
     picked, structure = jax.tree.flatten(selected(unknowns, scene, views), is_leaf=is_shared)
     stats = FitStats(
         seconds=time.perf_counter() - began,
@@ -190,6 +194,7 @@ def fit(
         stats=stats,
         cameras=views if found.views is None else found.views.cameras,
         settings=settings,
+        determined=jax.tree.unflatten(structure, marks[: len(picked)]) if determined.size else None,
     )
 
 

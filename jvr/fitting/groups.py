@@ -129,7 +129,7 @@ def _kept(problem: Problem, observations: Observations, keep: bool | int) -> Gro
     among = lambda select: problem.unknowns.among(problem.model, select)
     moving = problem.model.views is not None or among(lambda m: (m.scene.volume, m.scene.clipping))
     # What is kept is the scalar alone.
-    only_scalars = problem.integrator.marches and not problem.model.scene.needs_gradient
+    only_scalars = problem.marches and not problem.model.scene.needs_gradient
     if keep is False or moving or not only_scalars or isinstance(problem.loss, DSSIM):
         return Group(problem, observations)
     limit = KEEP_LIMIT if keep is True else keep

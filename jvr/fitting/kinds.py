@@ -127,19 +127,19 @@ def march_unknowns(problem: Problem) -> int:
 def adjoint_of(problem: Problem) -> AbstractAdjoint:
     """How the whole residual vector is differentiated."""
     # Rows do not know light that changes on its way: that of an environment, through a radiance transfer; ambient light.
-    transferred = lambda m: () if m.scene.radiance_transfer is None else (m.scene.environment_lights, m.scene.radiance_transfer)
-    around = lambda m: (transferred(m), m.scene.occlusion)
+    of_scene = lambda s: (s.environment, s.environment_lights, s.radiance_transfer)
+    around = lambda m: (() if m.scene.radiance_transfer is None else of_scene(m.scene), m.scene.occlusion)
     known = _has_rows(problem) and not problem.unknowns.among(problem.model, around) and problem.model.views is None
     return Rows() if known else Forward()
 
 
 def _has_rows(problem: Problem) -> bool:
-    return problem.integrator.marches and has_table_jacobian(problem.model.scene)
+    return problem.marches and has_table_jacobian(problem.model.scene)
 
 
 def _after_march(problem: Problem) -> frozenset[int]:
     """Which unknowns act on what a march has gathered, and not on the way."""
-    return problem.unknowns.among(problem.model, read_after_march) if problem.integrator.marches else frozenset()
+    return problem.unknowns.among(problem.model, read_after_march) if problem.marches else frozenset()
 
 
 def has_table_jacobian(scene: Scene) -> bool:

@@ -111,6 +111,8 @@ def next_view(
     **Raises** `ValueError` for a fit that has no information matrix (voxels) or has found cameras alone, without candidates, and for a
     candidate that does not see the volume.
     """
+    if not isinstance(result, FitResult):
+        raise TypeError(f"jvr.next_view takes what jvr.fit returns, not {type(result).__name__}")
     known = Knowledge.of(result)
     candidates = around(result.scene, result.cameras) if candidates is None else candidates
     return ranked(known, candidates, result.settings if settings is None else settings, pixels)

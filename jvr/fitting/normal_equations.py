@@ -278,7 +278,7 @@ def _jacobian(
     def observed(scene: Scene, arrays: Any) -> tuple[Prepared, Medium | None]:
         visible = None if around is None else eqx.combine(arrays, rest)
         prepared = prepare_in_fit(scene, problem.settings, problem.skips, visible)
-        return prepared, observed_medium(tile, problem.samples, prepared) if problem.integrator.marches else None
+        return prepared, observed_medium(tile, problem.samples, prepared) if problem.marches else None
 
     def look(part: Array, arrays: Any) -> tuple[Triple, Marched | None]:
         changed = kinds.changed(part, values)
@@ -296,7 +296,7 @@ def _jacobian(
         assert through is not None
         of_extinctions = kinds.entries.sigma_t is not None
         gathered, rows = table_jacobian(options, through, rays, prepared.dt, of_extinctions=of_extinctions)
-        _add_entries(model, gathered, rows, rays.length, kinds.entries, blocks)
+        _add_entries(model, gathered, rows, rays, kinds.entries, blocks)
     if kinds.inner.size:
         point = (values[kinds.inner], arrays)
         along = jax.vmap(lambda *t: jax.jvp(look, point, t, has_aux=True), out_axes=(None, 0, None))
@@ -308,11 +308,11 @@ def _jacobian(
     if gathered is None:
         return colours, blocks, of_views
     if kinds.outer.size:
-        after = lambda part: predict(kinds.changed(part, values, kinds.outer), gathered, rays.length)
+        after = lambda part: predict(kinds.changed(part, values, kinds.outer), gathered, rays)
         of_outer = jax.jacfwd(after)(values[kinds.outer])
         for c in range(3):
             blocks[c].append((of_outer[c], kinds.outer))
-    return predict(model, gathered, rays.length), blocks, of_views
+    return predict(model, gathered, rays), blocks, of_views
 
 
 def _rows_of_views(
@@ -337,7 +337,7 @@ def _rows_of_views(
         gathered, found = None, [channel.T for channel in jacobian]
     else:
         options = MarchOptions(problem.settings.termination, distance=False)
-        final = lambda gathered: predict(model, gathered, rays.length)
+        final = lambda gathered: predict(model, gathered, rays)
         gathered, of_rays = ray_jacobian(options, through, rays, prepared.dt, final)
         along = jax.vmap(lambda t: jax.jvp(move, (still,), (t,))[1])(basis)
         colours = ()
@@ -352,14 +352,14 @@ def _add_entries(
     model: ExposedModel,
     gathered: Marched,
     rows: TableJacobian,
-    length: Float[Array, "rays"],
+    rays: Rays,
     entries: TableEntries,
     blocks: list[Blocks],
 ) -> None:
     """Chains the rows of the march with what happens to radiance and optical depth after it, channel by channel."""
     ones = jax.tree.map(jnp.ones_like, (gathered.radiance, gathered.tau))
     zeros = jax.tree.map(jnp.zeros_like, ones)
-    final = lambda radiance, tau: predict(model, gathered._replace(radiance=radiance, tau=tau), length)
+    final = lambda radiance, tau: predict(model, gathered._replace(radiance=radiance, tau=tau), rays)
     _, by_radiance = jax.jvp(final, (gathered.radiance, gathered.tau), (ones[0], zeros[1]))
     _, by_tau = jax.jvp(final, (gathered.radiance, gathered.tau), (zeros[0], ones[1]))
     sigma_t = entries.sigma_t
@@ -367,7 +367,7 @@ def _add_entries(
         if entries.rgb is not None and rows.radiance_rgb:
             blocks[c].append((rows.radiance_rgb[c] * by_radiance[c][:, None], entries.rgb[:, c]))
         if sigma_t is not None:
-            block = jnp.zeros((length.shape[0], sigma_t.shape[0]), length.dtype)
+            block = jnp.zeros((rays.length.shape[0], sigma_t.shape[0]), rays.length.dtype)
             if rows.radiance_sigma:
                 block += rows.radiance_sigma[c] * by_radiance[c][:, None]
             if rows.tau_sigma:

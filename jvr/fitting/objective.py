@@ -71,7 +71,7 @@ def residual(
     problem: Problem, model: ExposedModel, tile: Observations, prepared: Prepared, adjoint: AbstractAdjoint = Replay()
 ) -> Triple:
     """Rendered minus target in each channel, differentiable in the mode of `adjoint`."""
-    through = observed_medium(tile, problem.samples, prepared) if problem.integrator.marches else None
+    through = observed_medium(tile, problem.samples, prepared) if problem.marches else None
     rays = rays_inside(model.scene, model.views, tile.rays)
     colours, _ = seen(problem, model, rays, through, prepared, adjoint)
     return tuple(c - tile.target[:, i] for i, c in enumerate(colours))
@@ -86,12 +86,12 @@ def seen(
         rgb = problem.integrator.radiance(prepared, rays).rgb
         return exposed(model, (rgb[:, 0], rgb[:, 1], rgb[:, 2])), None
     gathered = adjoint.march(MarchOptions(problem.settings.termination, distance=False), medium, rays, prepared.dt)
-    return predict(model, gathered, rays.length), gathered
+    return predict(model, gathered, rays), gathered
 
 
 def check_derivatives(problem: Problem, tiles: Observations, *, forwards: bool) -> None:
     """**Raises** `ValueError` where the radiance of an integrator has no derivative in the mode that a solver takes it in."""
-    if problem.integrator.marches:
+    if problem.marches:
         return
     # Whatever the loss: it is the radiance that may have none.
     problem, total = problem.least_squares(), jnp.ones(())
@@ -131,7 +131,7 @@ def _rendered(problem: Problem, model: ExposedModel, camera: AbstractCamera, pre
         problem, model, camera, prepared = shared
         _, near = near_volume(model.scene, camera)
         rays, _ = camera_rays(prepared.scene, near, pixels_of(blocks, height, width))
-        through = medium(prepared) if problem.integrator.marches else None
+        through = medium(prepared) if problem.marches else None
         return jnp.stack(seen(problem, model, rays, through, prepared, Replay())[0], axis=-1)
 
     shared = (problem.apart()[0], model, camera, prepared)

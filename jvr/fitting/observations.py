@@ -36,12 +36,14 @@ LEAST_SIDE, MOST_BLOCKS = 8, 4096
 
 
 class WorldRays(NamedTuple):
-    """Rays wherever in the world: one starts at `origin + low`, the eye is `behind` that by so much (see `AbstractCamera.rays_ahead`)."""
+    """Rays wherever in the world: one starts at `origin + low`, the eye is `behind` that by so much (see `AbstractCamera.rays_ahead`).
+    `pixel`: which of its view each is, `None` where that plays no part."""
 
     origin: Triple
     low: Triple
     direction: Triple
     behind: Float[Array, "..."]
+    pixel: Int[Array, "..."] | None = None
 
 
 class Observations(eqx.Module):
@@ -111,6 +113,17 @@ def check_settings(settings: Settings) -> None:
         raise ValueError("a fit resamples the midpoints of segments: leave Settings(quadrature=...) at jvr.Midpoint()")
 
 
+def check_views(scene: Scene, cameras: Sequence[AbstractCamera]) -> None:
+    """**Raises** `ValueError` for geometry that is not known from all cameras."""
+    if scene.geometry is None:
+        return
+    if scene.geometry.of_one_view and len(cameras) > 1:
+        name = type(scene.geometry).__name__
+        raise ValueError(f"a jvr.{name} is that of one view, and there are {len(cameras)}: fit one, or give a jvr.Mesh")
+    for camera in cameras:
+        scene.geometry.check_view(camera)
+
+
 def observe(
     scene: Scene,
     cameras: Sequence[AbstractCamera],
@@ -130,6 +143,7 @@ def observe(
     **Raises** `ValueError` for settings that fits do not support, where no ray meets the volume, or none of an unknown camera.
     """
     check_settings(settings)
+    check_views(scene, cameras)
     weights = check_weights(cameras, weights, images[0].dtype)
     # Compiled for all cameras of one size and kind.
     rays: list[Any] = [_rays(scene, camera) for camera in cameras]
@@ -180,7 +194,8 @@ def _rays(scene: Scene, camera: AbstractCamera) -> WorldRays:
     pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
     origin, direction, behind = camera.rays_ahead(pixels, ahead(scene, camera))
     starts = [two_sum(zero.high[i], zero.low[i], x) for i, x in enumerate(origin)]
-    return WorldRays(tuple(high for high, _ in starts), tuple(low for _, low in starts), direction, behind)
+    own = None if scene.geometry is None else pixels
+    return WorldRays(tuple(high for high, _ in starts), tuple(low for _, low in starts), direction, behind, own)
 
 
 def _pixels(view: int, camera: AbstractCamera) -> Pixels:
@@ -205,7 +220,7 @@ def inside(scene: Scene, rays: WorldRays) -> Rays:
         Exact(high, low).minus(Exact(zero.high[i], zero.low[i])).rounded()
         for i, (high, low) in enumerate(zip(rays.origin, rays.low, strict=True))
     )
-    return enter(scene, origin, rays.direction, rays.behind)[0]
+    return enter(scene, origin, rays.direction, rays.behind, rays.pixel)[0]
 
 
 def keep_samples(

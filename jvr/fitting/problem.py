@@ -3,12 +3,13 @@
 from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jvr.fitting.losses import AbstractPrior, SquaredError
 from jvr.fitting.observations import Samples
 from jvr.fitting.unknowns import ExposedModel, Unknowns
 from jvr.march.march import Marched
+from jvr.march.steps import Rays
 from jvr.rendering.integrator import AbstractRayIntegrator
 from jvr.rendering.settings import Settings
 from jvr.rendering.trace import composite
@@ -32,6 +33,12 @@ class Problem(eqx.Module):
         assert isinstance(self.settings.sampling, AbstractRayIntegrator)
         return self.settings.sampling
 
+    @property
+    def marches(self) -> bool:
+        """Whether what its rays bring is what a march gathers and one background behind it, so that their samples may be kept, and the
+        Jacobian of a table comes out of one replay."""
+        return self.integrator.marches and not self.model.scene.ends_rays
+
     def with_samples(self, samples: Samples) -> "Problem":
         return Problem(self.model, self.unknowns, self.settings, self.loss, self.priors, samples, self.skips)
 
@@ -53,9 +60,9 @@ class Problem(eqx.Module):
         return Problem(self.model, self.unknowns, self.settings, SquaredError(), (), self.samples, self.skips)
 
 
-def predict(model: ExposedModel, gathered: Marched, length: Float[Array, "rays"]) -> Triple:
+def predict(model: ExposedModel, gathered: Marched, rays: Rays) -> Triple:
     """Colours as the target images have them."""
-    return exposed(model, composite(model.scene, gathered, length)[0])
+    return exposed(model, composite(model.scene, gathered, rays)[0])
 
 
 def exposed(model: ExposedModel, rgb: Triple) -> Triple:

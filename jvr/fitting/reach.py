@@ -23,7 +23,9 @@ CORNER = 1 / 16
 
 def known_background(model: ExposedModel, unknowns: Unknowns) -> Float[np.ndarray, "3"] | None:
     """What a target shows where there is nothing in front of it, `None` where that is to be found."""
-    background = model.scene.background
+    background = model.scene.background_colour
+    if model.scene.ends_rays:
+        return None
     if background is None:
         return np.zeros(3)
     scaled = model.exposure is not None and np.any(background)
@@ -53,10 +55,10 @@ def _brightest(problem: Problem) -> float | None:
     """The most that a pixel can have, `None` where nothing bounds it: a mean of colours of the table and the background."""
     scene, unknowns = problem.model.scene, problem.unknowns
     bounded = isinstance(scene.transfer, AbstractTable) and isinstance(scene.optical, EmissionAbsorption | AbsorptionOnly)
-    if not bounded or scene.shows_light or problem.model.exposure is not None:
+    if not bounded or scene.shows_light or scene.ends_rays or problem.model.exposure is not None:
         return None
     highest = 0.0
-    for select in (lambda m: m.scene.transfer.rgb, lambda m: m.scene.background):
+    for select in (lambda m: m.scene.transfer.rgb, lambda m: m.scene.background_colour):
         among = unknowns.among(problem.model, select)
         if any(isinstance(unknowns.bijectors[i], Identity | Softplus) for i in among):
             return None

@@ -66,6 +66,8 @@ class FitResult(NamedTuple):
       it, NaN for more unknowns than a Gauss-Newton matrix is made for (those of voxels come from `jvr.voxel_errors`). Of a pose six: a
       rotation about the centre of the volume, in degrees about the x, y and z axes of the world, and a translation of it along these, as
       a world length (mm).
+    - `determined`: in the same structure, whether the images determine a value: its standard error is at most a quarter of how large it may
+      plausibly be; what is not was continued from its neighbours where the fit smooths. `None` for more unknowns than there are errors for.
     - `unknowns`: the paths of the fitted arrays, such as `transfer.rgb` or `cameras[0].fov_y`, in the order of `standard_errors`.
     - `information`: the inverse of the covariance of all fitted values, one after the other, as plain noise would have it, `(n, n)`; `None`
       where there are too many. `jvr.next_view` reads it.
@@ -85,6 +87,7 @@ class FitResult(NamedTuple):
     information: np.ndarray | None = None
     cameras: tuple[AbstractCamera, ...] = ()
     settings: Settings = Settings()
+    determined: Any = None
 
     @property
     def errors_by_name(self) -> dict[str, np.ndarray]:

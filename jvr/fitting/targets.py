@@ -163,8 +163,8 @@ def _over(behind: Float[np.ndarray, "3"] | None, images: list[np.ndarray], name:
             raise ValueError(f"the alpha of {name} {i} goes from {alpha.min():g} to {alpha.max():g}: it must be from 0 to 1")
         if behind is None:
             raise ValueError(
-                f"{name} {i} has an alpha, and what is behind it is to be found: a transparent picture says nothing about that, leave the "
-                "background (and, where there is one, the exposure) out of the fit"
+                f"{name} {i} has an alpha, and what is behind it is to be found, or differs from pixel to pixel: a transparent picture "
+                "says nothing about that, leave the background (and, where there is one, the exposure) out of the fit"
             )
         counts[i] = int(np.count_nonzero(alpha < 1))
         brighter += np.count_nonzero(np.max(image[..., :3], axis=-1) > 1.001 * alpha)

@@ -123,12 +123,14 @@ class Unknowns(eqx.Module):
 
     def plausible(self, model: ExposedModel, values: Float[np.ndarray, "unknowns"]) -> Float[np.ndarray, "unknowns"]:
         """How large each value may be, as far as it and its declaration say: the width of its range, else its own size, of an extinction at
-        least a tenth over one voxel, of anything without a unit that we know at least 1."""
+        least a tenth over one voxel, of anything without a unit that we know at least 1. Of a pose: a radian, the radius of the volume."""
         sizes, voxel = np.abs(values), float(jnp.min(model.scene.volume.spacing))
         ends = np.cumsum([value.size for value in self.values(model)])
-        for part, declared in zip(np.split(sizes, ends[:-1]), self.ranges, strict=True):
+        for part, declared, bijector in zip(np.split(sizes, ends[:-1]), self.ranges, self.bijectors, strict=True):
             known = isinstance(declared, Interval)
-            if known and np.isfinite(declared.high - declared.low):
+            if isinstance(bijector, Motion):
+                part[:] = bijector.forward(jnp.full(part.shape, np.rad2deg(1.0)))
+            elif known and np.isfinite(declared.high - declared.low):
                 part[:] = declared.high - declared.low
             else:
                 np.maximum(part, LEAST_DEPTH / voxel if known and declared.per_length else 1.0, out=part)

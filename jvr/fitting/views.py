@@ -69,7 +69,8 @@ class Views(eqx.Module):
                 mine = jnp.asarray(np.isin(np.arange(len(self.cameras)), members))[pixels.view]
                 own = jax.tree.map(lambda new, old, mine=mine: jnp.where(mine, new, old), own, found)
             found = own
-        return enter(near, *found)[0]
+        origin, direction, behind = found
+        return enter(near, origin, direction, behind, pixels.pixel)[0]
 
     def _rays(
         self, scene: Scene, near: Scene, members: list[int], own: Array, pixel: Array, shift: Shift | None

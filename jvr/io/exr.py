@@ -1,5 +1,6 @@
 """OpenEXR images read: the channels of one of their layers, in the frame of their display window."""
 
+import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from jvr.pictures import ImageError, Pixels, Plane, quiet
 
 # What programs call the channels of a layer.
 ROLES = {"red": "R", "green": "G", "blue": "B", "alpha": "A"}
+DEPTH = "Z"
 
 
 class Layer(NamedTuple):
@@ -27,33 +29,57 @@ def read_exr(path: Path, layer: str | None) -> tuple[Pixels, Plane | None]:
 
     **Raises** `ImageError` for a file that is damaged, deep or subsampled, and where it is not clear which layer is meant.
     """
-    check_exr(path)
-    with quiet():
-        import OpenEXR
-
-        try:
-            file = OpenEXR.File(str(path), header_only=True)
-            headers = [file.header(part) for part in range(len(file.parts))]
-        except Exception as error:
-            raise ImageError(path, f"the OpenEXR header is damaged or cut short ({one_line(error)}); export it again") from error
+    headers = _headers(path)
     part, colour, alpha = _chosen(path, headers, layer)
     wanted = (*colour, *alpha)
     low, high = _window(headers[part]["dataWindow"])
-    with quiet():
-        # OpenEXR says only on the terminal that pixels are missing, and then returns a file without parts.
-        try:
-            channels = OpenEXR.File(str(path), separate_channels=True).channels(part)
-            planes = [channels[name].pixels for name in wanted]
-        except Exception as error:
-            raise ImageError(path, "the pixels are damaged or cut short; copy or export the file again") from error
-    if any(plane.shape != tuple((high - low)[::-1]) for plane in planes):
-        raise ImageError(path, f"channels {', '.join(wanted)} do not have the full resolution; save them without subsampling")
+    planes = _planes(path, part, wanted, (high - low)[::-1])
     if any(not np.issubdtype(plane.dtype, np.floating) for plane in planes[len(colour) :]):
         wanted, planes = colour, planes[: len(colour)]
     pixels = np.stack([plane.astype(np.float32) for plane in planes], axis=-1)
     framed = _framed(pixels, low, *_window(headers[part]["displayWindow"]))
     picture = np.broadcast_to(framed[..., : len(colour)], (*framed.shape[:2], 3))
     return np.ascontiguousarray(picture), None if len(wanted) == len(colour) else framed[..., -1]
+
+
+def read_depth(path: str | os.PathLike) -> Plane:
+    """The channel Z of the first part that has one, 0 where there are no pixels. **Raises** as `read_exr`, and where there is none."""
+    path = Path(path)
+    headers = _headers(path)
+    part = next((i for i, header in enumerate(headers) if any(c.name == DEPTH for c in header["channels"])), None)
+    if part is None or _is_deep(headers[part]):
+        raise ImageError(path, f"it has no channel {DEPTH} of distances: `jvr render` writes one into each .exr")
+    low, high = _window(headers[part]["dataWindow"])
+    (plane,) = _planes(path, part, (DEPTH,), (high - low)[::-1])
+    return _framed(plane[..., None].astype(np.float32), low, *_window(headers[part]["displayWindow"]))[..., 0]
+
+
+def _headers(path: Path) -> list[dict[str, Any]]:
+    check_exr(path)
+    with quiet():
+        import OpenEXR
+
+        try:
+            file = OpenEXR.File(str(path), header_only=True)
+            return [file.header(part) for part in range(len(file.parts))]
+        except Exception as error:
+            raise ImageError(path, f"the OpenEXR header is damaged or cut short ({one_line(error)}); export it again") from error
+
+
+def _planes(path: Path, part: int, wanted: tuple[str, ...], shape: np.ndarray) -> list[np.ndarray]:
+    """Channels of a part, each of the whole data window, so many rows and columns."""
+    with quiet():
+        import OpenEXR
+
+        # OpenEXR says only on the terminal that pixels are missing, and then returns a file without parts.
+        try:
+            channels = OpenEXR.File(str(path), separate_channels=True).channels(part)
+            planes = [channels[name].pixels for name in wanted]
+        except Exception as error:
+            raise ImageError(path, "the pixels are damaged or cut short; copy or export the file again") from error
+    if any(plane.shape != tuple(shape) for plane in planes):
+        raise ImageError(path, f"channels {', '.join(wanted)} do not have the full resolution; save them without subsampling")
+    return planes
 
 
 def _chosen(path: Path, headers: list[dict[str, Any]], name: str | None) -> Layer:

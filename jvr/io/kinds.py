@@ -20,6 +20,8 @@ from jvr.model.effects import (
     AbstractShadows,
 )
 from jvr.model.environment import EnvironmentLight
+from jvr.model.environment_map import EnvironmentMap
+from jvr.model.geometry import AbstractGeometry
 from jvr.model.interpolation import AbstractInterpolation
 from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
@@ -92,6 +94,8 @@ KINDS: dict[type, dict[str, str]] = {
         "constant": "EnvironmentLight.constant",
         "disc": "EnvironmentLight.disc",
     },
+    EnvironmentMap: {"image": "EnvironmentMap.from_image", "gradient": "EnvironmentMap.gradient"},
+    AbstractGeometry: {"image": "DepthImage.from_image"},
     AbstractOpticalModel: {
         "emission-absorption": "EmissionAbsorption",
         "emission-only": "EmissionOnly",

@@ -71,13 +71,17 @@ def read_knowledge(path: Path) -> Saved:
         with np.load(path, allow_pickle=False) as file:
             meta = json.loads(str(file["meta"]))
             arrays = {name: file[name] for name in file.files if name != "meta"}
+        if meta.get("version") == VERSION:
+            return _saved(meta, arrays)
     except OSError:
         raise
-    # Whatever NumPy, zipfile and JSON say of damaged bytes.
+    # Whatever NumPy, zipfile and JSON say of damaged bytes, and of parts that are missing.
     except Exception as error:
         raise KnowledgeError(f"{path}: damaged, or not written by a fit: run the fit again") from error
-    if meta.get("version") != VERSION:
-        raise KnowledgeError(f"{path}: written by another version of jvr: run the fit again")
+    raise KnowledgeError(f"{path}: written by another version of jvr: run the fit again")
+
+
+def _saved(meta: dict[str, Any], arrays: dict[str, np.ndarray]) -> Saved:
     given: dict[str, Any] = meta["config"]
     config = config_from(given["data"], given["name"], Path(given["folder"]))
     config = dataclasses.replace(config, overridden=tuple(meta["overridden"]))

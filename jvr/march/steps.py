@@ -15,16 +15,36 @@ from jvr.numerics import larger
 from jvr.types import Channels, Scalar, Triple
 
 
+class End(NamedTuple):
+    """What rays see where they end, behind the medium that they cross, each component an array of shape `(rays,)`.
+
+    - `rgb`: radiance that arrives from there, without that of a background of one colour;
+    - `opaque`: 1 where a ray ends at something opaque, 0 where it goes on to what is far away;
+    - `distance`: world length from the ray's entry to what is opaque, 0 where nothing is.
+    """
+
+    rgb: Triple
+    opaque: Float[Array, "rays"]
+    distance: Float[Array, "rays"]
+
+
 class Rays(NamedTuple):
     """A batch of rays inside a medium, each component an array of shape `(rays,)`.
 
     `entry` and `direction` are in grid coordinates, `direction` per world length; `length` is the world length from entry to exit,
-    0 where the ray misses.
+    0 where the ray misses. `end`: what is behind the medium, where that differs from ray to ray; a march does not need it
+    (`without_end`).
     """
 
     entry: Triple
     direction: Triple
     length: Float[Array, "rays"]
+    end: End | None = None
+
+    @property
+    def without_end(self) -> "Rays":
+        """The rays as a march takes them: what is behind is not carried through its wavefronts."""
+        return self._replace(end=None)
 
 
 class Point(NamedTuple):

@@ -81,18 +81,7 @@ class EnvironmentLight(AbstractLight):
         `jvr.sh.window`, against ringing about bright lamps; `None` for none. **Raises** `ValueError` for maps that are not 2:1 or hold NaN,
         infinite or negative radiance, and what reading a file raises.
         """
-        if isinstance(image, str | os.PathLike):
-            from jvr.io.environment import read_environment
-
-            image = read_environment(image)
-        if known(image) is not None:
-            as_radiance(image, "an environment map")
-        pixels = float_array(image, "an environment map", (None, None, 3))
-        height, width, _ = pixels.shape
-        if width != 2 * height:
-            raise ValueError(f"an environment map is twice as wide as high, not {width} x {height}: crop or resample it to 2:1")
-        require(pixels, NOT_NEGATIVE.holds, "an environment map must be finite and not negative: mend its pixels")
-        return cls(_windowed(harmonics.project_map(pixels, order), window), clamped=clamped)
+        return cls(_windowed(harmonics.project_map(map_pixels(image), order), window), clamped=clamped)
 
     @classmethod
     def from_function(
@@ -143,6 +132,27 @@ class EnvironmentLight(AbstractLight):
             return NotImplemented
         large, small = sorted((self.coefficients, other.coefficients), key=len, reverse=True)
         return EnvironmentLight(large.at[: len(small)].add(small), clamped=self.clamped and other.clamped)
+
+
+def map_pixels(image: str | os.PathLike | ArrayLike) -> Float[Array, "height width 3"]:
+    """The radiance of a latitude-longitude map, of a file or an array; **raises** as `EnvironmentLight.from_image`."""
+    if isinstance(image, str | os.PathLike):
+        from jvr.io.environment import read_environment
+
+        image = read_environment(image)
+    check_map(image)
+    pixels = float_array(image, "an environment map", (None, None, 3))
+    require(pixels, NOT_NEGATIVE.holds, "an environment map must be finite and not negative: mend its pixels")
+    return pixels
+
+
+def check_map(image: ArrayLike) -> None:
+    """**Raises** `ValueError` for codes in place of radiance, and for maps that are not 2:1."""
+    if known(image) is not None:
+        as_radiance(image, "an environment map")
+    height, width, _ = float_array(image, "an environment map", (None, None, 3)).shape
+    if width != 2 * height:
+        raise ValueError(f"an environment map is twice as wide as high, not {width} x {height}: crop or resample it to 2:1")
 
 
 def _windowed(coefficients: Float[Array, "bands 3"], window: float | int | None) -> Float[Array, "bands 3"]:

@@ -183,7 +183,8 @@ def _checked(field: dataclasses.Field, value: Any, lengths: dict[str, int]) -> A
     classes = parts_of(field.type)
     if classes and typing.get_origin(field.type) is tuple:
         return _parts(field, value, classes, lengths)
-    if classes:
+    # A field may take an array in the place of a part.
+    if classes and (isinstance(value, eqx.Module) or not takes_array(field.type)):
         if not isinstance(value, classes):
             found = repr(value) if isinstance(value, str) else type(value).__name__
             raise TypeError(f"{field.name} must be {about.doc}, not {found}")
@@ -192,6 +193,11 @@ def _checked(field: dataclasses.Field, value: Any, lengths: dict[str, int]) -> A
         require_within(value.values, field.name, about)
         return value
     return array_of(value, field.name, about, shapes_of(field), lengths)
+
+
+def takes_array(annotation: Any) -> bool:
+    """Whether an annotation names an array, alone or beside parts of a scene."""
+    return any(hasattr(kind, "dim_str") for kind in alternatives(annotation))
 
 
 def _parts(field: dataclasses.Field, value: Any, classes: tuple[type, ...], lengths: dict[str, int]) -> tuple[Any, ...]:

@@ -66,6 +66,11 @@ class AbstractPart(eqx.Module):
         """Whether it makes the environment's light visible."""
         return False
 
+    @property
+    def ends_rays(self) -> bool:
+        """Whether what rays see behind the medium, or where they end, differs from ray to ray because of it."""
+        return False
+
     def title(self, name: str, scene: Any) -> str:
         """What `jvr.advise` calls it; `name`: of the field that holds it."""
         return f"{name} {spelling(self)}"

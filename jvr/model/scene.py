@@ -18,6 +18,8 @@ from jvr.model.effects import (
     AbstractShadows,
 )
 from jvr.model.environment import EnvironmentLight
+from jvr.model.environment_map import EnvironmentMap
+from jvr.model.geometry import AbstractGeometry
 from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
@@ -36,7 +38,7 @@ class Scene(AbstractPart):
 
     - `volume`: `jvr.Volume`.
     - `transfer`: a transfer function, `jvr.LinearTransfer`, `jvr.LutTransfer` or `jvr.GaussianTransfer`.
-    - `background`: `(3,)` linear RGB that shows through what is transparent, or `None`.
+    - `background`: what shows through what is transparent: `(3,)` linear RGB, `jvr.EnvironmentMap`, or `None`.
     - `optical`: `jvr.EmissionAbsorption()` (default), `jvr.EmissionOnly()` or `jvr.AbsorptionOnly()`.
     - `clipping`: `jvr.ClippingBox` or `None`.
     - `lights`: any number of `jvr.DirectionalLight`, `jvr.PointLight`, `jvr.SpotLight`, `jvr.HeadLight`, `jvr.AmbientLight` and
@@ -45,12 +47,14 @@ class Scene(AbstractPart):
     - `shadows`: how much of each light reaches a point: `jvr.ShadowRays`, `jvr.ShadowVolume`, `jvr.ShadowMap`, `jvr.OpacityShadowMap`,
       `jvr.DeepShadowMap`, or `None`: all of it.
     - `scattering`: what the medium makes of light: `jvr.SingleScattering` or `None`.
-    - `environment`: light from far away in all directions: `jvr.EnvironmentLight` or `None`; adds to those among `lights`.
+    - `environment`: light from far away in all directions: `jvr.EnvironmentLight`, `jvr.EnvironmentMap` or `None`; adds to those among
+      `lights`.
     - `material`: what a point makes of the environment's light: a BRDF such as `jvr.MicrofacetBRDF(...)`, `jvr.HarmonicMaterial`,
       `jvr.MaterialByValue`, or `None`.
     - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
     - `occlusion`: how much of the ambient light the medium near a point takes away: `jvr.LocalOcclusion(...)`,
       `jvr.HistogramOcclusion(...)`, or `None`: nothing.
+    - `geometry`: opaque geometry that rays end at, `jvr.DepthImage`, or `None`.
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
       `jvr.ForwardDifferences()`, `jvr.CentralDifferences()`, `jvr.SobelDifferences()`, `jvr.PrecomputedGradient()`.
 
@@ -60,7 +64,7 @@ class Scene(AbstractPart):
 
     volume: Volume = parameter(doc="a jvr.Volume, as jvr.read_volume gives it")
     transfer: AbstractTransfer = parameter(doc="one of jvr's")
-    background: Vector | None = parameter(COLOUR, doc="red, green, blue, linear")
+    background: Vector | EnvironmentMap | None = parameter(COLOUR, doc="red, green, blue, linear, or a jvr.EnvironmentMap")
     optical: AbstractOpticalModel = parameter(doc="one of jvr's")
     clipping: ClippingBox | None = parameter(doc="a jvr.ClippingBox")
     lights: tuple[AbstractLight, ...] = parameter(doc="a sequence of jvr's lights")
@@ -68,17 +72,18 @@ class Scene(AbstractPart):
     shadows: AbstractShadows | None = parameter(doc="one of jvr's")
     scattering: AbstractScattering | None = parameter(doc="one of jvr's")
     normals: AbstractNormals = parameter(doc="one of jvr's")
-    environment: EnvironmentLight | None = parameter(doc="a jvr.EnvironmentLight")
+    environment: EnvironmentLight | EnvironmentMap | None = parameter(doc="a jvr.EnvironmentLight or a jvr.EnvironmentMap")
     material: AbstractMaterial | None = parameter(doc="one of jvr's")
     radiance_transfer: AbstractRadianceTransfer | None = parameter(doc="a jvr.RadianceTransfer")
     occlusion: AbstractOcclusion | None = parameter(doc="one of jvr's")
+    geometry: AbstractGeometry | None = parameter(doc="a jvr.DepthImage")
 
     def __init__(
         self,
         volume: Volume,
         transfer: AbstractTransfer,
         *,
-        background: ArrayLike | None = None,
+        background: ArrayLike | EnvironmentMap | None = None,
         optical: AbstractOpticalModel = EmissionAbsorption(),
         clipping: ClippingBox | None = None,
         lights: Sequence[AbstractLight] = (),
@@ -86,14 +91,15 @@ class Scene(AbstractPart):
         shadows: AbstractShadows | None = None,
         scattering: AbstractScattering | None = None,
         normals: AbstractNormals = AnalyticGradient(),
-        environment: EnvironmentLight | None = None,
+        environment: EnvironmentLight | EnvironmentMap | None = None,
         material: AbstractMaterial | None = None,
         radiance_transfer: AbstractRadianceTransfer | None = None,
+        geometry: AbstractGeometry | None = None,
         occlusion: AbstractOcclusion | None = None,
     ):
         assign(self, volume=volume, transfer=transfer, background=background, optical=optical, clipping=clipping)
         assign(self, lights=lights, shading=shading, shadows=shadows, scattering=scattering, normals=normals)
-        assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer)
+        assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer, geometry=geometry)
         assign(self, occlusion=occlusion)
         _check_light(self)
         _check_environment(self)
@@ -128,8 +134,17 @@ class Scene(AbstractPart):
         return self.shows_lights or any(part.shows_environment for _, part in parts_of(self))
 
     @property
+    def ends_rays(self) -> bool:
+        return isinstance(self.background, EnvironmentMap) or any(part.ends_rays for _, part in parts_of(self))
+
+    @property
+    def background_colour(self) -> Vector | None:
+        """The background where it is one colour for all rays, else `None`."""
+        return None if isinstance(self.background, EnvironmentMap) else self.background
+
+    @property
     def environment_lights(self) -> tuple[EnvironmentLight, ...]:
-        """Its environment and those among its lights."""
+        """Its environment, as harmonics, and those among its lights."""
         return _environments(self.lights, self.environment)
 
     @property
@@ -147,7 +162,7 @@ class Scene(AbstractPart):
         return any(part.needs_gradient for _, part in parts_of(self))
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        return () if self.background is None else (PlanEntry("background", True, "shows through"),)
+        return () if self.background_colour is None else (PlanEntry("background", True, "shows through"),)
 
     def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
         if not self.lights and self.shows_lights:
@@ -184,7 +199,11 @@ def _casters(lights: Sequence[AbstractLight]) -> tuple[AbstractDeltaLight | None
     return tuple(light if isinstance(light, AbstractDeltaLight) and light.casts_shadows else None for light in lights)
 
 
-def _environments(lights: Sequence[AbstractLight], environment: EnvironmentLight | None) -> tuple[EnvironmentLight, ...]:
+def _environments(
+    lights: Sequence[AbstractLight], environment: EnvironmentLight | EnvironmentMap | None
+) -> tuple[EnvironmentLight, ...]:
+    if isinstance(environment, EnvironmentMap):
+        environment = environment.to_harmonics(environment.order)
     return tuple(light for light in (environment, *lights) if isinstance(light, EnvironmentLight))
 
 

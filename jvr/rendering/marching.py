@@ -3,14 +3,13 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jvr.march.march import Marched, MarchOptions
 from jvr.march.steps import Rays
 from jvr.model.scene import Scene
 from jvr.rendering.integrator import AbstractRayIntegrator, Radiance
 from jvr.rendering.medium import Prepared, medium
-from jvr.rendering.trace import composite
+from jvr.rendering.trace import composite, seen_end
 
 
 class Uniform(AbstractRayIntegrator):
@@ -24,13 +23,16 @@ class Uniform(AbstractRayIntegrator):
 
     def radiance(self, prepared: Prepared, rays: Rays) -> Radiance:
         settings = prepared.settings
-        gathered = settings.adjoint.march(MarchOptions(settings.termination, True), medium(prepared), rays, prepared.dt)
-        return radiance_of(prepared.scene, gathered, rays.length)
+        options = MarchOptions(settings.termination, True)
+        gathered = settings.adjoint.march(options, medium(prepared), rays.without_end, prepared.dt)
+        return radiance_of(prepared.scene, gathered, rays)
 
 
-def radiance_of(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> Radiance:
-    """What rays of some length bring that were marched with their distance."""
-    rgb, alpha = composite(scene, gathered, length)
+def radiance_of(scene: Scene, gathered: Marched, rays: Rays) -> Radiance:
+    """What rays bring that were marched with their distance."""
+    rgb, alpha = composite(scene, gathered, rays)
     distance = sum(gathered.distance, jnp.zeros_like(alpha)) / max(len(gathered.distance), 1)
+    if rays.end is not None:
+        distance += seen_end(gathered, rays.end) * rays.end.distance
     assert gathered.steps is not None
     return Radiance(jnp.stack(rgb, axis=-1), alpha, distance, gathered.steps)

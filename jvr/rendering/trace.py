@@ -8,11 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jvr.march.march import Marched
-from jvr.march.steps import Rays
+from jvr.march.steps import End, Rays
 from jvr.model.camera import AbstractCamera
 from jvr.model.clipping import interval_inside
+from jvr.model.environment_map import EnvironmentMap
 from jvr.model.scene import Scene
-from jvr.numerics import larger, one_minus_exp
+from jvr.numerics import larger, one_minus_exp, smaller
 from jvr.types import Scalar, Triple
 
 if TYPE_CHECKING:
@@ -38,10 +39,11 @@ def near_volume(scene: Scene, *others: Any) -> Any:
     positions are taken before they are rounded. Derivatives are those in the world of the scene."""
     scene, *cameras = promote_dtypes(scene, *others)
     origin = jax.lax.stop_gradient(scene.volume.origin)
-    placed = lambda s: (s.volume, s.clipping, s.lights)
+    placed = lambda s: (s.volume, s.clipping, s.lights, s.geometry)
     lights = tuple(light.moved(origin) for light in scene.lights)
     clipping = None if scene.clipping is None else scene.clipping.moved(origin)
-    parts = (scene.volume.moved(origin), clipping, lights)
+    geometry = None if scene.geometry is None else scene.geometry.moved(origin)
+    parts = (scene.volume.moved(origin), clipping, lights, geometry)
     scene = eqx.tree_at(placed, scene, parts, is_leaf=lambda x: x is None)
     return scene, *(camera.moved(origin) for camera in cameras)
 
@@ -60,40 +62,86 @@ def step_length(scene: Scene, settings: "Settings") -> Scalar:
 
 
 def enter(
-    scene: Scene, origin: Triple, direction: Triple, behind: Float[Array, "rays"] | float = 0.0
+    scene: Scene,
+    origin: Triple,
+    direction: Triple,
+    behind: Float[Array, "rays"] | float = 0.0,
+    pixels: Int[Array, "rays"] | None = None,
 ) -> tuple[Rays, Float[Array, "rays"]]:
     """World rays inside the volume (and its clipping box), and the distance from the eye, which is `behind` their origin by so much, to
     where they enter.
 
-    A ray with non-finite numbers gets the length NaN, which `composite` turns into a NaN pixel.
+    They end at opaque geometry, and where what is behind differs from ray to ray, they know what they see there. `pixels`: of each, `None`
+    where they are of none (`jvr.model.geometry.AbstractGeometry.hit`). A ray with non-finite numbers gets the length NaN, which
+    `composite` turns into a NaN pixel.
     """
     start = scene.volume.grid_from_world(origin)
     along = scene.volume.grid_from_world(direction, direction=True)
     t_in, t_out = interval_inside(scene.volume, scene.clipping, (origin, direction), (start, along))
     t_in = larger(t_in, -behind)
+    met = None if scene.geometry is None else scene.geometry.hit((origin, direction), behind, pixels)
+    t_out = t_out if met is None else smaller(t_out, met[0])
     hit = t_out > t_in
+    # Those that miss are counted from the eye.
+    end = _end(scene, direction, met, jnp.where(hit, t_in, -behind))
     # A ray that misses gets harmless numbers before any arithmetic, so that its derivative is zero and not 0 * inf.
     t_in, t_out = jnp.where(hit, t_in, 0.0), jnp.where(hit, t_out, 0.0)
     keep = lambda v: tuple(jnp.where(hit, x, 0.0) for x in v)
     poison = jnp.where(jnp.isfinite(sum(start) + sum(along)), 0.0, jnp.nan)
     start, along = keep(start), keep(along)
     entry = tuple(s + t_in * d for s, d in zip(start, along, strict=True))
-    return Rays(entry, along, t_out - t_in + poison), jnp.where(hit, behind + t_in, 0.0)
+    return Rays(entry, along, t_out - t_in + poison, end), jnp.where(hit, behind + t_in, 0.0)
+
+
+def _end(
+    scene: Scene, direction: Triple, met: tuple[Float[Array, "rays"], Triple] | None, t_in: Float[Array, "rays"]
+) -> End | None:
+    """What rays end at that enter at `t_in`, `None` where that is a background of one colour or nothing at all. `met`: how far away
+    geometry is, and its radiance."""
+    nothing = jnp.zeros_like(direction[0])
+    far, end = (nothing,) * 3, None
+    if isinstance(scene.background, EnvironmentMap):
+        seen = scene.background.radiance(jnp.stack(direction, axis=1))
+        far = (seen[:, 0], seen[:, 1], seen[:, 2])
+        end = End(far, nothing, nothing)
+    if met is None:
+        return end
+    t, rgb = met
+    there = t < jnp.inf
+    colours = tuple(jnp.where(there, near, behind) for near, behind in zip(rgb, far, strict=True))
+    return End(colours, there.astype(t.dtype), jnp.where(there, jnp.where(there, t, 0.0) - t_in, 0.0))
 
 
 def camera_rays(scene: Scene, camera: AbstractCamera, pixels: Int[Array, "rays"]) -> tuple[Rays, Float[Array, "rays"]]:
     """The rays of some pixels inside the volume, and the distance from the eye to where they enter; scene and camera near the volume."""
-    return enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)))
+    if scene.geometry is not None:
+        scene.geometry.check_view(camera)
+    return enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)), pixels)
 
 
-def composite(scene: Scene, gathered: Marched, length: Float[Array, "rays"]) -> tuple[Triple, Float[Array, "rays"]]:
-    """Colour of each ray with the background behind the medium, and the medium's opacity."""
+def composite(scene: Scene, gathered: Marched, rays: Rays) -> tuple[Triple, Float[Array, "rays"]]:
+    """Colour of each ray with what is behind the medium, and the opacity of the medium and of what is opaque behind it."""
     transmittances = tuple(jnp.exp(-tau) for tau in gathered.tau)
-    zero = jnp.where(jnp.isnan(length), jnp.nan, 0.0)
+    zero = jnp.where(jnp.isnan(rays.length), jnp.nan, 0.0)
     rgb = tuple(zero + L for L in gathered.radiance or (0.0, 0.0, 0.0))
-    if scene.background is not None:
+    behind = _behind(scene, rays)
+    if behind is not None:
         clear = transmittances * (3 // len(transmittances)) if transmittances else (1.0, 1.0, 1.0)
-        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, scene.background, strict=True))
+        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, behind, strict=True))
     # Not 1 - T: thin media keep their digits.
     alpha = sum((one_minus_exp(tau) for tau in gathered.tau), zero) / max(len(gathered.tau), 1)
-    return rgb, alpha
+    return rgb, alpha if rays.end is None else alpha + seen_end(gathered, rays.end)
+
+
+def seen_end(gathered: Marched, end: End) -> Float[Array, "rays"]:
+    """How much is seen of what is opaque behind the medium, the mean over channels."""
+    transmittances = [jnp.exp(-tau) for tau in gathered.tau]
+    return end.opaque * (sum(transmittances, jnp.zeros_like(end.opaque)) / len(transmittances) if transmittances else 1.0)
+
+
+def _behind(scene: Scene, rays: Rays) -> Any:
+    """Radiance behind the medium in three channels, or `None` where there is none."""
+    colour, end = scene.background_colour, rays.end
+    if end is None:
+        return colour
+    return end.rgb if colour is None else tuple(c + (1 - end.opaque) * b for c, b in zip(end.rgb, colour, strict=True))

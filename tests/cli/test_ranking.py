@@ -128,6 +128,7 @@ def test_cameras_that_are_none_are_one_line(line, hint, here, capfd):
         ("older", "run the fit again, jvr fit --force"),
         ("newer", "written by another version of jvr: run the fit again"),
         ("damaged", "damaged, or not written by a fit"),
+        ("incomplete", "damaged, or not written by a fit"),
         ("voxels", "too many unknowns"),
         ("empty --cameras fit.toml --count 3", "leave it or --cameras out"),
         ("empty --count 0", "--count"),
@@ -138,15 +139,16 @@ def test_cameras_that_are_none_are_one_line(line, hint, here, capfd):
 def test_what_cannot_be_ranked_is_one_line(line, hint, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("JVR_CACHE", "0")
-    for name in ("empty", "unfinished", "older", "newer", "damaged", "voxels"):
+    for name in ("empty", "unfinished", "older", "newer", "damaged", "incomplete", "voxels"):
         (tmp_path / name).mkdir()
     (tmp_path / "unfinished" / "checkpoint.npz").touch()
-    for name in ("older", "newer", "damaged", "voxels"):
+    for name in ("older", "newer", "damaged", "incomplete", "voxels"):
         (tmp_path / name / "result.json").touch()
     config = {"data": tomllib.loads(FIT), "name": "fit.toml", "folder": str(tmp_path)}
     meta = {"version": 1, "config": config, "overridden": [], "unknowns": [], "variance": 1.0, "exposure": 1.0}
     meta["refused"] = "the fit has too many unknowns"
     for name, version in (("newer", 1000), ("voxels", 1)):
         np.savez(tmp_path / name / "knowledge.npz", meta=np.array(json.dumps(meta | {"version": version})))
+    np.savez(tmp_path / "incomplete" / "knowledge.npz", meta=np.array(json.dumps(meta | {"unknowns": ["transfer.rgb"]})))
     (tmp_path / "damaged" / "knowledge.npz").write_bytes(b"PK\x03\x04")
     refused(line, hint, capfd)

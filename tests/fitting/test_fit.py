@@ -169,6 +169,7 @@ def test_unknowns_are_told_apart_by_their_place():
     result = fit(scene, unknowns=pick, max_steps=1)
     assert result.unknowns == ("transfer.domain", "transfer.rgb", "transfer.sigma_t")
     np.testing.assert_array_equal(result.errors_by_name["transfer.sigma_t"], result.standard_errors["sigma_t"])
+    assert jax.tree.map(np.shape, result.determined) == jax.tree.map(np.shape, result.standard_errors)
 
 
 def test_weights_take_pixels_out():
@@ -305,6 +306,7 @@ def test_voxels_are_found_by_a_first_order_solver():
     result = fit(start, unknowns=lambda s: s.volume.values, solver=solver, max_steps=60)
     assert result.history[-1].loss < 0.02 * result.history[0].loss
     assert np.all(np.isnan(result.standard_errors))
+    assert result.determined is None
     with pytest.raises(ValueError, match="LBFGS"):
         fit(start, unknowns=lambda s: s.volume.values)
 

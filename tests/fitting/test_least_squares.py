@@ -146,6 +146,7 @@ def _scipy(scene: jvr.Scene, images: list[np.ndarray]):
     )
 
 
+@pytest.mark.slow
 def test_a_fit_ends_where_scipys_bounded_least_squares_does():
     """The truth is a finer table, so that the bottom is not zero and some unknowns end at their bounds; from a grey and a dark start."""
     rng = np.random.default_rng(4)

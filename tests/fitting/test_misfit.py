@@ -165,5 +165,9 @@ def test_what_no_picture_shows_is_continued_by_a_fit():
         np.testing.assert_allclose(last, np.broadcast_to(last[:1], last.shape), atol=1e-5)
     error = lambda result: np.mean(np.square(np.asarray(jvr.residuals(result.scene, CAMERAS, noisy, SETTINGS))))
     assert error(quiet) <= error(left) * (1 + MOST_INCREASE) * (1 + 1e-4)
+    # What was continued is what is said not to be determined, of which errors that are infinite are a part.
+    told = dict(zip(quiet.unknowns, quiet.determined, strict=True))
+    assert {name: np.count_nonzero(~mark) for name, mark in told.items()} == dict(quiet.stats.smoothed)
+    assert not any(np.any(told[name] & unseen[name]) for name in told)
     for name, errors in quiet.errors_by_name.items():
         np.testing.assert_allclose(errors, left.errors_by_name[name], rtol=1e-3)

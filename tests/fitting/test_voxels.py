@@ -18,6 +18,7 @@ import jvr
 from jvr import cli
 from jvr.fitting.unknowns import ExposedModel, choose_unknowns
 from jvr.io.config import ConfigError, build_fit, read_config
+from jvr.io.demo import demo_volume
 from jvr.io.volumes.written import write_metaimage
 from jvr.model.grids import coarser, on_grid, resampled
 
@@ -412,6 +413,13 @@ def test_a_configuration_says_priors_start_range_and_grids(desk):
     assert (within.low, within.high) == (pytest.approx(-0.2), pytest.approx(1.6))
     smooth = build_fit(read_config("voxels.toml", ["fit.solver=lbfgs"])).keywords["transforms"][0]
     assert type(smooth) is jvr.Sigmoid
+    beside = build_fit(
+        read_config("voxels.toml", ['fit.unknowns=["cameras.fov_y", "volume.values", "cameras[0].world_from_camera"]'])
+    )
+    arrays = jax.tree.leaves(beside.keywords["unknowns"](beside.scene, beside.cameras))
+    given = beside.keywords["transforms"]
+    assert len(given) == len(arrays) == 5
+    assert [array.ndim == 3 for array in arrays] == [transform is not None for transform in given]
     with pytest.raises(ConfigError, match=r"fit\.voxels.*name 'volume\.values' in fit\.unknowns"):
         read_config("voxels.toml", ['fit.unknowns=["transfer.rgb"]'])
 
@@ -433,6 +441,26 @@ def test_the_command_line_fits_voxels_and_draws_what_it_found(desk, capsys):
     assert cli.run(["fit", "voxels.toml", "-o", "out", "--resume"]) == 0
     again = jvr.read_volume("out/volume.mha")
     np.testing.assert_array_equal(again.values, found.values)
+
+
+@pytest.mark.slow
+def test_the_configuration_finds_the_embedded_volume(tmp_path, monkeypatch):
+    monkeypatch.setenv("JVR_CACHE", "0")
+    config = Path(__file__).parents[2] / "configs" / "voxels.toml"
+    sizes = {
+        "camera.width": 16,
+        "camera.height": 16,
+        "camera.count": 6,
+        "settings.step": 2.0,
+        "fit.max_steps": 4,
+        "fit.voxels.levels": 2,
+    }
+    small = [word for name, value in sizes.items() for word in ("--set", f"{name}={value}")]
+    assert cli.run(["fit", str(config), "-o", str(tmp_path / "out"), *small]) == 0
+    found, truth = jvr.read_volume(tmp_path / "out" / "volume.mha"), demo_volume()
+    assert found.shape == truth.shape
+    error = lambda values: float(np.sqrt(np.mean(np.square(np.asarray(values, float) - np.asarray(truth.values)))))
+    assert error(found.values) < error(0.2) / 2
 
 
 def test_a_volume_that_was_written_is_read_again(tmp_path):

@@ -1,10 +1,10 @@
-"""A hundred damaged files of each format: each is read or refused in one line, soon, in little memory, with nothing on the terminal."""
+"""Fifty damaged files of each format: each is read or refused in one line, soon, in little memory, with nothing on the terminal."""
 
 import pytest
 from parent import findings
 from seeds import all_seeds
 
-COUNT = 100
+COUNT = 50
 
 
 @pytest.fixture(scope="module")

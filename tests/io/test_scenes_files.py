@@ -164,6 +164,8 @@ SCENES = {
     "occluded": lambda: lit(lights=[jvr.AmbientLight()], occlusion=jvr.LocalOcclusion(8, radius=2, samples=3, bias=0.1)),
     "histograms": histograms,
     "negative": lambda: natural(environment=jvr.EnvironmentLight(-0.0 * np.ones((4, 3)), clamped=False)),
+    "seen": lambda: natural(environment=(sky := jvr.EnvironmentMap(voxels((4, 8, 3)), order=2)), background=sky),
+    "geometry": lambda: scene(geometry=jvr.DepthImage(np.where(voxels((3, 4)) < 0.5, np.inf, 2.0), voxels((3, 4, 3)))),
     "materials": materials,
     "projected": projected,
     "frozen": frozen,

@@ -31,12 +31,13 @@ def stored(**keywords) -> jvr.Volume:
 
 VOLUMES = {"NaN": lambda: jvr.Volume(constant()), "padding": stored, "packed": lambda: stored().packed()}
 QUADRATURES = {"midpoint": jvr.Midpoint(), "pre-integrated": jvr.PreIntegrated()}
+DEFAULT = [("NaN", "pre-integrated"), ("packed", "midpoint")]
 
 
 @pytest.mark.parametrize(
     ("kind", "quadrature"),
     [
-        pytest.param(kind, quadrature, marks=pytest.mark.slow if quadrature != "midpoint" and kind != "NaN" else [])
+        pytest.param(kind, quadrature, marks=[] if (kind, quadrature) in DEFAULT else pytest.mark.slow)
         for kind in VOLUMES
         for quadrature in QUADRATURES
     ],

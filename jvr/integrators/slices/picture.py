@@ -99,7 +99,7 @@ def picture_of(view: View, sampling: Slices, *, distances: DistanceField | None 
     gathered, ended, samples = marched
 
     crop = lambda x: x.reshape(*options.shape(0), *x.shape[1:])[1 : camera.height + 1, 1 : camera.width + 1]
-    found = radiance_of(scene, gathered, finest.length)
+    found = radiance_of(scene, gathered, finest)
     rgb, alpha, depth, steps = jax.tree.map(crop, (found.rgb, found.alpha, found.depth(t_in), found.steps))
     full = jnp.where(lattice.last >= 0, jnp.minimum(ended, lattice.last) - lattice.first + 1, 0)
     return Rendering(rgb, alpha, depth, RenderStats(steps, SliceStats(samples, jnp.sum(full, dtype=jnp.int32))))
@@ -114,6 +114,8 @@ def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
         raise ValueError(f"jvr.Slices() interpolates between samples, which {name}() volumes do not allow: {UNIFORM}")
     if scene.shows_light:
         raise ValueError(f"jvr.Slices() does not know light: {UNIFORM}, or take shading and scattering out of the scene")
+    if scene.geometry is not None:
+        raise ValueError(f"jvr.Slices() does not know geometry, at whose edges rays end apart: {UNIFORM}")
     if not isinstance(settings.adjoint, Replay):
         raise ValueError(
             f"jvr.Slices() needs Settings(adjoint=jvr.Replay()), not jvr.{type(settings.adjoint).__name__}(): {UNIFORM}"

@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jvr.io.config.cameras import cameras_of
-from jvr.io.config.environment import Precompute, environment_parts, fit_scene, keeps_radiance_transfer, precomputed
+from jvr.io.config.environment import (
+    Precompute,
+    background_of,
+    environment_parts,
+    fit_scene,
+    geometry_of,
+    keeps_radiance_transfer,
+    precomputed,
+)
 from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.light import graded, light_parts, lights_of_views
 from jvr.io.config.load import Config, started
@@ -202,7 +210,7 @@ def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
     fitted = () if tables.fit is None else tables.fit.unknowns
     if not any(name.startswith("volume.") for name in fitted):
         volume = graded(volume, light, transfer)
-    surroundings = {"background": tables.background, "clipping": clipping}
+    surroundings = {"background": background_of(config), "clipping": clipping, "geometry": geometry_of(config)}
     if tables.optical is not None:
         surroundings["optical"] = made(config.where, "optical", tables.optical)
     return Scene(volume, transfer, **surroundings, **light)
@@ -250,7 +258,7 @@ def _all_keywords(config: Config, fit: FitTable, scene: Scene, cameras: tuple[Ab
         "unknowns": unknowns_of(config, fit, scene, cameras),
         "settings": build_settings(config),
     }
-    return keywords | {"transforms": transforms_of(fit, scene.volume)}
+    return keywords | {"transforms": transforms_of(fit, scene.volume, len(cameras))}
 
 
 def _keywords(config: Config, fit: FitTable) -> dict[str, Any]:

@@ -11,15 +11,19 @@ from jvr.io.config.load import Config
 from jvr.io.config.parts import made
 from jvr.io.config.schema.environment import (
     EnvironmentTable,
+    GeometryImageTable,
     ImageTable,
     MaterialsTable,
     MaterialTable,
     MerlTable,
     RadianceTransferTable,
     RotationTable,
+    SurroundingsImageTable,
+    SurroundingsTable,
 )
 from jvr.model.effects import AbstractMaterial
 from jvr.model.environment import EnvironmentLight
+from jvr.model.environment_map import EnvironmentMap
 from jvr.model.material import AbstractBRDF
 from jvr.model.scene import Scene, material_order
 
@@ -42,6 +46,31 @@ def environment_parts(config: Config) -> dict[str, Any]:
             order = material_order(parts["environment"], parts.get("radiance_transfer"))
             parts["material"] = _material(config, tables.material, order)
     return parts
+
+
+def background_of(config: Config) -> Any:
+    """What a configuration says is behind the volume: a colour, a map or nothing."""
+    table = config.tables.background
+    if not isinstance(table, SurroundingsTable):
+        return table
+    if isinstance(table, SurroundingsImageTable):
+        found = _from_file(config, "background", table, EnvironmentMap.from_image)
+        found = EnvironmentMap(table.scale * found.pixels, order=found.order)
+    else:
+        found = made(config.where, "background", table, "rotation")
+    with blame(config.where("background"), "background"):
+        return found.rotated(_rotation(table.rotation)) if table.rotation else found
+
+
+def geometry_of(config: Config) -> Any:
+    """The opaque geometry of a configuration, or `None`."""
+    table = config.tables.geometry
+    if not isinstance(table, GeometryImageTable):
+        return None if table is None else made(config.where, "geometry", table)
+    place = "geometry.path"
+    image = config.find(table.path, place, table.source)
+    with blame(config.where(place), place):
+        return table.part(image)
 
 
 def precomputed(scene: Scene, **keywords: Any) -> Scene:
@@ -93,12 +122,16 @@ def _environment(config: Config, key: str, table: EnvironmentTable) -> Environme
 
 
 def _image(config: Config, key: str, table: ImageTable) -> EnvironmentLight:
+    return EnvironmentLight(table.scale * _from_file(config, key, table, EnvironmentLight.from_image).coefficients)
+
+
+def _from_file(config: Config, key: str, table: ImageTable | SurroundingsImageTable, read: Callable[..., Any]) -> Any:
+    """What `read` makes of the file of a table and of its other keys."""
     place = f"{key}.path"
     image = config.find(table.path, place, table.source)
     keywords = {name: value for name, value in table.given().items() if name not in ImageTable.model_fields}
     with blame(config.where(place), place):
-        light = EnvironmentLight.from_image(image, **keywords)
-    return EnvironmentLight(table.scale * light.coefficients)
+        return read(image, **keywords)
 
 
 def _rotation(turns: list[RotationTable]) -> np.ndarray:

@@ -36,12 +36,14 @@ def start_voxels(fit: FitTable, volume: Volume) -> Volume:
     return dataclasses.replace(volume, values=jnp.full(volume.shape, stored), gaps=None, missing=None)
 
 
-def transforms_of(fit: FitTable, volume: Volume) -> tuple[Any, ...] | None:
-    """One for each unknown: the voxels in their range, all others as their classes declare."""
+def transforms_of(fit: FitTable, volume: Volume, views: int) -> tuple[Any, ...] | None:
+    """One for each unknown array: the voxels in their range, all others as their classes declare. A name such as `cameras.fov_y` is an
+    array of each of as many views."""
     if fit.voxels is None or fit.voxels.range is None:
         return None
     from jvr.fitting.bijectors import Bounded, Sigmoid
 
     low, high = sorted(float((end - volume.intercept) / volume.slope) for end in fit.voxels.range)
     within = Bounded(low, high, high - low) if fit.solver in ("lbfgsb", *LEAST_SQUARES) else Sigmoid(low, high)
-    return tuple(within if name == VOXELS else None for name in fit.unknowns)
+    arrays = (name for name in fit.unknowns for _ in range(views if name.startswith("cameras.") else 1))
+    return tuple(within if name == VOXELS else None for name in arrays)

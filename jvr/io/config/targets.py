@@ -38,9 +38,10 @@ def views_in_files(
     choices = {"encoding": fit.encoding, "alpha": fit.alpha, "layer": fit.layer}
     # Only what is said: the rest is found in the files.
     choices = {name: value for name, value in choices.items() if value is not None}
-    background = config.tables.background or [0.0, 0.0, 0.0]
+    table = config.tables.background or [0.0, 0.0, 0.0]
     # Where nothing is behind the volume, light over black is what a picture holds; where that is to be found, nobody knows yet.
-    is_known = "background" not in fit.unknowns and not (fit.exposure and any(background))
+    background = table if isinstance(table, list) and not (fit.exposure and any(table)) else None
+    is_known = "background" not in fit.unknowns
     images = _read(
         config, fit.images or [], "fit.images", cameras, read_image, background=background if is_known else None, **choices
     )

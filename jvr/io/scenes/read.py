@@ -11,6 +11,7 @@ from jvr.io.config.errors import ConfigError, blame, did_you_mean, shown
 from jvr.io.scenes.arrays import Arrays, number_type
 from jvr.io.scenes.kinds import NONE, PARTS, class_named, classes_of, entry_of, fits, implied, kinds_of, wanted
 from jvr.io.scenes.made import is_derived, is_static, made
+from jvr.model.parameters import takes_array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +80,7 @@ class Reader:
             return tuple(self.part(one, entry, f"{key}[{i}]") for i, one in enumerate(raw))
         is_stored = isinstance(raw, dict) and "array" in raw
         is_part, takes_parts = isinstance(raw, dict | str) and not is_stored, bool(classes_of(annotation))
-        if takes_parts and not is_part:
+        if takes_parts and not is_part and not takes_array(annotation):
             raise ConfigError(self.where, key, f"is {shown(raw)}; it must be {self._wanted(annotation)}")
         if is_part and (takes_parts or annotation is Any):
             return self.part(raw, annotation, key)

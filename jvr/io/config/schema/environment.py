@@ -10,9 +10,11 @@ from pydantic import BeforeValidator, Discriminator, Field, PlainValidator, Tag,
 
 from jvr.io.config.checks import number, numbers, problem
 from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, PartTable, checked_table, part, table_of
-from jvr.io.config.schema.table import Positions, Steepness, Table, one_or_more
+from jvr.io.config.schema.table import Colour, Positions, Steepness, Table, one_or_more
 from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
 from jvr.model.environment import EnvironmentLight
+from jvr.model.environment_map import EnvironmentMap
+from jvr.model.geometry import AbstractGeometry
 from jvr.model.material import AbstractBRDF
 from jvr.model.ranges import DIRECTION, NOT_NEGATIVE
 
@@ -42,8 +44,37 @@ class ImageTable(EnvironmentTable):
     scale: Annotated[float, number("factor between the map's radiance and the scene's", NOT_NEGATIVE)] = 1.0
 
 
+class SurroundingsTable(KindTable):
+    """What maps that are seen directly have: how they are turned, one turn after the other."""
+
+    rotation: Rotations = Field(default=[])
+
+
+class SurroundingsImageTable(SurroundingsTable):
+    """Where a map that is seen directly lies."""
+
+    path: str
+    source: str | None = None
+    scale: Annotated[float, number("factor between the map's radiance and the scene's", NOT_NEGATIVE)] = 1.0
+
+
+class GeometryImageTable(KindTable):
+    """Where the picture of geometry lies, with its depth."""
+
+    path: str
+    source: str | None = None
+
+
+BASES[AbstractGeometry, "image"] = GeometryImageTable
+Geometry = Annotated[Any, part(AbstractGeometry)]
 BASES |= {EnvironmentLight: EnvironmentTable, (EnvironmentLight, "image"): ImageTable}
+BASES |= {EnvironmentMap: SurroundingsTable, (EnvironmentMap, "image"): SurroundingsImageTable}
 Environments = Annotated[list[Annotated[Any, part(EnvironmentLight)]], BeforeValidator(one_or_more)]
+# A colour, or what is seen in every direction.
+Background = Annotated[
+    Annotated[Colour, Tag("(colour)")] | Annotated[Any, part(EnvironmentMap), Tag("(map)")],
+    Discriminator(lambda value: "(map)" if isinstance(value, dict | str | KindTable) else "(colour)"),
+]
 
 
 class MaterialTable(KindTable):

@@ -7,10 +7,10 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
-from jvr.io.config.schema.environment import Environments, Material, RadianceTransfer
+from jvr.io.config.schema.environment import Background, Environments, Geometry, Material, RadianceTransfer
 from jvr.io.config.schema.light import Lights, Normals, Occlusion, OneOrMore, Scattering, Shading, Shadows, casts_shadows
 from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, only, part
-from jvr.io.config.schema.table import Colour, Extinction, Position, Range, Scalar, Table, one_or_more
+from jvr.io.config.schema.table import Extinction, Position, Range, Scalar, Table, one_or_more
 from jvr.io.config.schema.transfer import Transfer
 from jvr.io.kinds import maker_of
 from jvr.model.camera import AbstractCamera
@@ -241,7 +241,7 @@ class ConfigTable(Table):
     volume: VolumeTable
     transfer: Transfer | None = None
     truth: Transfer | None = None
-    background: Colour | None = None
+    background: Background | None = None
     optical: Annotated[Any, part(AbstractOpticalModel)] | None = None
     clipping: Annotated[Any, only(ClippingBox)] | None = None
     lights: Lights = Field(default=[])
@@ -252,6 +252,7 @@ class ConfigTable(Table):
     environment: Environments = Field(default=[])
     material: Material | None = None
     radiance_transfer: RadianceTransfer | None = None
+    geometry: Geometry | None = None
     occlusion: Occlusion | None = None
     camera: Cameras = Field(default=[{}])
     settings: Annotated[Any, only(Settings)] = Field(default={}, validate_default=True)
