@@ -36,6 +36,20 @@ RADIUS, OFFSET = 16.0, 1.0
 GOLDEN = math.pi * (3 - math.sqrt(5))
 
 
+class ProjectedOcclusion(eqx.Module):
+    """Occlusion as it was computed, on the grid of the voxels.
+
+    - `taken`: `(x, y, z, 1)`, or `(x, y, z, 3)` for coloured extinction: `1 - I`, which is also 0 where nothing is visible and nothing was
+      computed.
+    - `cache_key`: checksums of what it was made of (`jvr.model.kept.content`).
+    - `pinned`: whether it stays as it is although the scene is another.
+    """
+
+    taken: Float[Array, "x y z channels"]
+    cache_key: UInt32[Array, "parts 2"]
+    pinned: bool = eqx.field(static=True, default=False)
+
+
 class LocalOcclusion(AbstractOcclusion):
     """Local ambient occlusion: the mean over directions of the light that is scattered to a point from within a ball around it.
 
@@ -71,7 +85,7 @@ class LocalOcclusion(AbstractOcclusion):
     resolution: float = choice(Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start")
     bias: Scalar = parameter(UNIT_INTERVAL, doc="share of ambient light that nothing takes away")
     gamma: Scalar | None = parameter(POSITIVE, doc="exponent of what is left of ambient light")
-    projected: "ProjectedOcclusion | None" = parameter(doc="what has been computed beforehand")
+    projected: ProjectedOcclusion | None = parameter(doc="what has been computed beforehand")
 
     def __init__(
         self,
@@ -125,7 +139,7 @@ class LocalOcclusion(AbstractOcclusion):
             resolution=self.resolution,
         )
 
-    def finished(self, scene: Scene, *nodes: Any) -> "ProjectedOcclusion":
+    def finished(self, scene: Scene, *nodes: Any) -> ProjectedOcclusion:
         return ProjectedOcclusion(self._taken(scene.volume, *nodes), jnp.asarray(self.cache_key(scene)))
 
     def visibility(self, scene: Scene, path: LightPath) -> "OcclusionVisibility":
@@ -138,20 +152,6 @@ class LocalOcclusion(AbstractOcclusion):
         not much thicker than they are apart."""
         coarse = nodes.reshape(*node_shape(volume, self.resolution), -1)
         return jnp.clip(resampled_cubic(coarse, volume.shape), 0.0, 1.0)
-
-
-class ProjectedOcclusion(eqx.Module):
-    """Occlusion as it was computed, on the grid of the voxels.
-
-    - `taken`: `(x, y, z, 1)`, or `(x, y, z, 3)` for coloured extinction: `1 - I`, which is also 0 where nothing is visible and nothing was
-      computed.
-    - `cache_key`: checksums of what it was made of (`jvr.model.kept.content`).
-    - `pinned`: whether it stays as it is although the scene is another.
-    """
-
-    taken: Float[Array, "x y z channels"]
-    cache_key: UInt32[Array, "parts 2"]
-    pinned: bool = eqx.field(static=True, default=False)
 
 
 class OcclusionVisibility(AbstractVisibility):

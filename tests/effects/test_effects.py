@@ -41,7 +41,10 @@ ENVIRONMENT = {
         jvr.LambertBRDF(0.8), radiance_transfer=jvr.RadianceTransfer(1, 4, bleeding=jvr.TransferBleeding())
     ),
 }
-PAIRS = [*itertools.combinations(EFFECTS, 2), *zip(("haze", "surfaces", "radiance_transfer", "haze"), EFFECTS, strict=True)]
+PAIRS = [
+    *itertools.combinations(EFFECTS, 2),
+    *zip(("haze", "surfaces", "radiance_transfer", "haze", "haze"), EFFECTS, strict=True),
+]
 
 
 def transfer(scale=0.6):
