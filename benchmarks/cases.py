@@ -21,6 +21,7 @@ from benchmarks import scenes, yardsticks
 from benchmarks.light import light
 from benchmarks.poses import pose_step
 from benchmarks.preparation import preparation
+from benchmarks.surfaces import surfaces
 from benchmarks.timing import median, ratio, seconds
 from benchmarks.voxels import voxel_step
 from jvr.march.march import MarchOptions, march
@@ -254,6 +255,7 @@ CASES = {
     "resident": resident,
     "preparation": preparation,
     "light": light,
+    "surfaces": surfaces,
     "fitting": fitting,
     "startup": startup,
 }

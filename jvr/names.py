@@ -28,6 +28,7 @@ NAMES = {
     "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
     "jvr.effects.histogram_occlusion": ("HistogramOcclusion", "LocalHistograms"),
     "jvr.effects.occlusion": ("LocalOcclusion",),
+    "jvr.effects.isosurfaces": ("Isosurfaces",),
     "jvr.effects.radiance_transfer": ("MaterialBleeding", "RadianceTransfer", "TransferBleeding"),
     "jvr.effects.scattering": ("SingleScattering",),
     "jvr.effects.shading": ("BlinnPhong", "Lambert", "Phong"),

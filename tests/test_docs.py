@@ -217,7 +217,7 @@ def test_the_reference_has_every_public_name():
     assert "settings=Settings()" in text
     assert "py:function} jvr.sh.project(" in text
     assert "py:function} jvr.presets.ct()" in text
-    assert "py:classmethod} look_at(eye, target, up, fov_y, width, height)" in text
+    assert "py:classmethod} look_at(eye, target, up, fov_y, width, height, *, near=None, far=None)" in text
     # Tables of functions and methods, and what configurations call them.
     orbit, disc = (text.split(head)[1].split("::::")[0] for head in ("jvr.orbit(", "classmethod} disc("))
     assert "| `axis` | x, y, z; what is up in every picture | (3,) | a direction of any length but zero | `(0, 0, 1)` |" in orbit

@@ -59,8 +59,11 @@ class LitShader(OpticalShader):
         rgb = tuple(c * a + b for c, a, b in zip(classified.rgb, factor, added, strict=True))
         return self.optical.evaluate_segment(Classified(rgb, classified.sigma_t), dt)
 
-    def light_at(self, sample: Sample, point: Point, classified: Classified, dt: Scalar) -> tuple[Triple, Triple]:
-        """`a` and `b` of a sample that stands for a segment of length `dt` of a medium."""
+    def light_at(
+        self, sample: Sample, point: Point, classified: Classified, dt: Scalar, *, is_surface: bool = False
+    ) -> tuple[Triple, Triple]:
+        """`a` and `b` of a sample that stands for a segment of length `dt` of a medium, or of a point that `is_surface` whatever the length
+        of its gradient."""
         zero = jnp.zeros_like(sample.s)
         x = transformed(self.world_from_grid, point.p)
         w_o, _ = direction_and_length(turned(-self.world_from_grid[:3, :3], point.direction))
@@ -68,6 +71,8 @@ class LitShader(OpticalShader):
         normal, magnitude = direction_and_length(tuple(-g for g in sample.gradient)) if sample.gradient else ((zero,) * 3, zero)
         surface = zero if shading is None else shading.surface_weight(magnitude)
         cut = zero
+        if is_surface:
+            surface = cut = surface_weight(magnitude, zero)
         if self.cut is not None:
             # What is hardly a surface has hardly a say in the normal.
             weight = (

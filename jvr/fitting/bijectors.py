@@ -255,6 +255,8 @@ def bijector_of(within: Range, value: Float[Array, "..."], voxel: Float[Array, "
         # Of one scale: an entry that is zero has none of its own.
         return Entrywise(tuple(bijector_of(interval, value, voxel, bounds) for interval in within.intervals))
     if isinstance(within, Increasing):
+        if value.size < 2:
+            return Identity()  # it has no gap
         scale = jnp.mean(jnp.diff(value))
         return Ordered(scale) if bounds is None else Gaps(scale)
     low, high = within.low, within.high

@@ -13,12 +13,12 @@ from jaxtyping import Array, Float, Int, UInt16
 
 from jvr.execution.devices import everywhere, on_devices, over_rays, shares
 from jvr.fitting.targets import check_weights
-from jvr.fitting.views import Pixels, Shift, Views
+from jvr.fitting.views import Pixels, Shift, Views, limits_of, with_planes
 from jvr.march.fields import MISSING, CachedSamples, VoxelField
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.quadrature import Midpoint
 from jvr.march.steps import Rays, points_at, segment_count, segment_span
-from jvr.model.camera import AbstractCamera
+from jvr.model.camera import AbstractCamera, Limits
 from jvr.model.exact import Exact
 from jvr.model.scene import Scene
 from jvr.model.transfer import AbstractTable
@@ -37,13 +37,14 @@ LEAST_SIDE, MOST_BLOCKS = 8, 4096
 
 class WorldRays(NamedTuple):
     """Rays wherever in the world: one starts at `origin + low`, the eye is `behind` that by so much (see `AbstractCamera.rays_ahead`).
-    `pixel`: which of its view each is, `None` where that plays no part."""
+    `pixel`: which of its view each is, `None` where that plays no part; `limits`: as of `AbstractCamera`."""
 
     origin: Triple
     low: Triple
     direction: Triple
     behind: Float[Array, "..."]
     pixel: Int[Array, "..."] | None = None
+    limits: Limits = (None, None)
 
 
 class Observations(eqx.Module):
@@ -146,7 +147,8 @@ def observe(
     check_views(scene, cameras)
     weights = check_weights(cameras, weights, images[0].dtype)
     # Compiled for all cameras of one size and kind.
-    rays: list[Any] = [_rays(scene, camera) for camera in cameras]
+    planes = with_planes(cameras)
+    rays: list[Any] = [_rays(scene, camera, planes) for camera in cameras]
     lengths = [np.asarray(inside(scene, one).length) for one in rays]
     _check_views(lengths, scene, unknown)
     length = np.concatenate(lengths)
@@ -186,16 +188,24 @@ def _blocks(cameras: Sequence[AbstractCamera]) -> Int[np.ndarray, "pixels"]:
     return np.concatenate(blocks).astype(np.int32)
 
 
-@jax.jit
-def _rays(scene: Scene, camera: AbstractCamera) -> WorldRays:
+@functools.partial(jax.jit, static_argnums=2)
+def _rays(scene: Scene, camera: AbstractCamera, planes: tuple[bool, bool]) -> WorldRays:
     """The rays of a camera from near the volume on: starts in the world as two floats, directions, and the distances from the eye."""
     zero = scene.volume.origin
     scene, camera = near_volume(scene, camera)
     pixels = jnp.arange(camera.width * camera.height, dtype=jnp.int32)
-    origin, direction, behind = camera.rays_ahead(pixels, ahead(scene, camera))
+    start = ahead(scene, camera)
+    origin, direction, behind = camera.rays_ahead(pixels, start)
     starts = [two_sum(zero.high[i], zero.low[i], x) for i, x in enumerate(origin)]
     own = None if scene.geometry is None else pixels
-    return WorldRays(tuple(high for high, _ in starts), tuple(low for _, low in starts), direction, behind, own)
+    return WorldRays(
+        tuple(high for high, _ in starts),
+        tuple(low for _, low in starts),
+        direction,
+        behind,
+        own,
+        limits_of(camera, direction, start, planes),
+    )
 
 
 def _pixels(view: int, camera: AbstractCamera) -> Pixels:
@@ -220,7 +230,7 @@ def inside(scene: Scene, rays: WorldRays) -> Rays:
         Exact(high, low).minus(Exact(zero.high[i], zero.low[i])).rounded()
         for i, (high, low) in enumerate(zip(rays.origin, rays.low, strict=True))
     )
-    return enter(scene, origin, rays.direction, rays.behind, rays.pixel)[0]
+    return enter(scene, origin, rays.direction, rays.behind, rays.pixel, rays.limits)[0]
 
 
 def keep_samples(

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jvr.model.camera import AbstractCamera, OrthographicCamera, PerspectiveCamera
+from jvr.model.camera import AbstractCamera, Limits, OrthographicCamera, PerspectiveCamera
 from jvr.types import Scalar, Triple
 
 
@@ -17,6 +17,7 @@ class ImagePlane(NamedTuple):
     origin: tuple[tuple[Scalar, Scalar, Scalar], ...]
     direction: tuple[tuple[Scalar, Scalar, Scalar], ...]
     ahead: Scalar
+    camera: AbstractCamera
 
     def rays(self, column: Float[Array, "points"], row: Float[Array, "points"]) -> tuple[Triple, Triple, Float[Array, "points"]]:
         """Points on the plane, unit directions, and distances from the eye; integers are pixel centres, as in
@@ -25,6 +26,10 @@ class ImagePlane(NamedTuple):
         origin, direction = at(self.origin), at(self.direction)
         norm = jnp.sqrt(sum(d * d for d in direction))
         return origin, tuple(d / norm for d in direction), self.ahead * norm
+
+    def limits(self, direction: Triple) -> Limits:
+        """How far from their points on the plane rays cross the near and the far plane of the camera."""
+        return self.camera.limits(direction, self.ahead)
 
     @property
     def size(self) -> tuple[Scalar, Scalar]:
@@ -50,4 +55,4 @@ def image_plane(camera: AbstractCamera, ahead: Scalar) -> ImagePlane:
     forward = [-camera.world_from_camera[i, 2] for i in range(3)]
     along = sum(d * f for d, f in zip(direction, forward, strict=True))
     linear = lambda v: tuple((x[0], (x[1] - x[0]) / camera.width, (x[2] - x[0]) / camera.height) for x in v)
-    return ImagePlane(linear(origin), linear(tuple(d / along for d in direction)), ahead)
+    return ImagePlane(linear(origin), linear(tuple(d / along for d in direction)), ahead, camera)

@@ -122,7 +122,8 @@ def _trace(
 ) -> tuple[Float[Array, "pixels 5"], Int[Array, "pixels"]]:
     """Colour, opacity and opacity-weighted depth of the pixels of a mask, and their steps."""
     column, row = (x.astype(prepared.scene.volume.slope.dtype) for x in (grid.column, grid.row))
-    rays, t_in = enter(prepared.scene, *plane.rays(column, row))
+    origin, direction, behind = plane.rays(column, row)
+    rays, t_in = enter(prepared.scene, origin, direction, behind, limits=plane.limits(direction))
     # A ray without length is not marched.
     found = Uniform().radiance(prepared, rays._replace(length=jnp.where(mask, rays.length, 0.0)))
     depth = t_in * found.alpha + found.distance

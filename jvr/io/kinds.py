@@ -18,6 +18,7 @@ from jvr.model.effects import (
     AbstractScattering,
     AbstractShading,
     AbstractShadows,
+    AbstractSurfaces,
 )
 from jvr.model.environment import EnvironmentLight
 from jvr.model.environment_map import EnvironmentMap
@@ -55,6 +56,7 @@ KINDS: dict[type, dict[str, str]] = {
         "opacity-map": "OpacityShadowMap",
         "deep-map": "DeepShadowMap",
     },
+    AbstractSurfaces: {"isosurfaces": "Isosurfaces"},
     AbstractScattering: {"single": "SingleScattering"},
     AbstractPhase: {
         "isotropic": "Isotropic",

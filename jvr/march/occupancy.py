@@ -6,6 +6,7 @@ bricks, and a ray inside of it goes on with the first sample outside. Samples st
 without take the same contributing samples.
 """
 
+import functools
 import itertools
 
 import equinox as eqx
@@ -93,6 +94,14 @@ def occupancy_of(
     return Occupancy(empty_radius, empty_radius_of_slopes, bricks.size)
 
 
+def occupancy_of_values(bricks: Bricks, slope: Scalar, intercept: Scalar, values: Float[Array, "n"]) -> Occupancy:
+    """Which bricks of a volume hold any of these scalars somewhere. Not differentiable."""
+    low, high = _scalar_bounds(bricks, *jax.lax.stop_gradient((slope, intercept)))
+    holds = [(low <= value) & (value <= high) for value in jax.lax.stop_gradient(values)]
+    (empty_radius,) = _empty_radii(~(functools.reduce(jnp.logical_or, holds) | jnp.isnan(low + high)))
+    return Occupancy(empty_radius, None, bricks.size)
+
+
 def visible_bricks(
     bricks: Bricks,
     slope: Scalar,
@@ -105,14 +114,18 @@ def visible_bricks(
     """Bricks that a transfer function gives more extinction than `least`, by default none, somewhere between their bounds; `nearby`: also
     those where it has a derivative in the scalar. Not differentiable."""
     slope, intercept, transfer = jax.lax.stop_gradient((slope, intercept, transfer))
+    low, high = _scalar_bounds(bricks, slope, intercept)
+    is_visible = jax.vmap(lambda low, high: transfer.is_visible(low, high, 0.0 if least is None else least, nearby=nearby))
+    return is_visible(low.ravel(), high.ravel()).reshape(low.shape) | jnp.isnan(low + high)
+
+
+def _scalar_bounds(bricks: Bricks, slope: Scalar, intercept: Scalar) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+    """The smallest and the largest scalar that interpolation may return in each brick."""
     scaled = [slope * bound.astype(slope.dtype) for bound in (bricks.lower, bricks.upper)]
     ends = [end + intercept for end in scaled]
     # Interpolated values exceed those they are made of by a few roundings.
     margin = 8 * jnp.finfo(slope.dtype).eps * (jnp.maximum(*map(jnp.abs, scaled)) + jnp.abs(intercept))
-    low, high = jnp.minimum(*ends) - margin, jnp.maximum(*ends) + margin
-
-    is_visible = jax.vmap(lambda low, high: transfer.is_visible(low, high, 0.0 if least is None else least, nearby=nearby))
-    return is_visible(low.ravel(), high.ravel()).reshape(low.shape) | jnp.isnan(low + high)
+    return jnp.minimum(*ends) - margin, jnp.maximum(*ends) + margin
 
 
 def _empty_radii(*empty: Bool[Array, "bx by bz"]) -> list[UInt8[Array, "bx by bz"]]:

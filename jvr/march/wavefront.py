@@ -35,6 +35,7 @@ def wavefront_while(
     inputs: Inputs,
     shared: Shared,
     work: Int[Array, "rays"],
+    idle_fraction: float = IDLE,
 ) -> tuple[Results, Shared]:
     """`while any(alive): advance` for every ray, of which at most `WAVEFRONT` are in flight (more on accelerators).
 
@@ -43,7 +44,8 @@ def wavefront_while(
     that no long ray is left alone at the end; rays without any are not started, and their results are zero. Results come in the
     order of `inputs`.
 
-    Finished rays are thus not paid for, and memory in flight does not grow with the picture.
+    Finished rays are thus not paid for, and memory in flight does not grow with the picture. `idle_fraction`: of the wavefront that may
+    idle before rays are regenerated, which costs as much as several steps: where rays take few, more than for long ones.
 
     Under `vmap` loops go on for all of a batch while one of it has something to do: a condition for each would make JAX select between all
     of the old state and the new in every step, `shared` included.
@@ -68,7 +70,7 @@ def wavefront_while(
 
     def drain_and_regenerate(carry):
         own, state, shared, index, following, results = carry
-        enough = jnp.where(following < size, int(width * (1 - IDLE)), tail)
+        enough = jnp.where(following < size, int(width * (1 - idle_fraction)), tail)
         state, shared = jax.lax.while_loop(
             lambda c: unvmap_any(jnp.sum(alive(own, c[0])) > enough), lambda c: advance(own, *c), (state, shared)
         )

@@ -1,7 +1,7 @@
 """Cameras: where the ray of each pixel starts and where it goes."""
 
 import abc
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -12,9 +12,11 @@ from jaxtyping import Array, Float, Int
 from jvr.model.checks import affine, float_array, require
 from jvr.model.exact import Exact, Remainder, in_double
 from jvr.model.parameters import TRIPLE, arguments, assign, choice, parameter
-from jvr.model.ranges import ANGLE_OF_VIEW, AT_LEAST_ONE, DIRECTION, POSITIVE
-from jvr.numerics import normalise
+from jvr.model.ranges import ANGLE_OF_VIEW, AT_LEAST_ONE, DIRECTION, NOT_NEGATIVE, POSITIVE, Interval
+from jvr.numerics import dot, normalise
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector
+
+BEYOND = Interval(0.0, ends="(]", takes_infinity=True)
 
 
 def pixels() -> Any:
@@ -27,6 +29,16 @@ def angle_of_view() -> Any:
     return parameter(ANGLE_OF_VIEW, doc="full vertical angle", unit="degrees")
 
 
+def near_plane() -> Any:
+    """The declaration of the plane in front of which nothing is seen."""
+    return parameter(NOT_NEGATIVE, doc="distance along the view in front of which nothing is seen", unit="mm")
+
+
+def far_plane() -> Any:
+    """The declaration of the plane behind which nothing of the volume is seen."""
+    return parameter(BEYOND, doc="distance along the view behind which nothing is seen", unit="mm")
+
+
 def around() -> dict[str, Any]:
     """The declarations of the arguments of cameras that look inwards from all around."""
     center = parameter(doc="x, y, z", unit="mm", shapes=TRIPLE)
@@ -35,8 +47,15 @@ def around() -> dict[str, Any]:
     return {"center": center, "radius": radius, "count": count, "fov_y": angle_of_view(), "width": pixels(), "height": pixels()}
 
 
+# Distances along rays, or `None`.
+Limits: TypeAlias = tuple[Float[Array, "..."] | None, Float[Array, "..."] | None]
+
+
 class AbstractCamera(eqx.Module):
     """A camera looks along -z of its own frame, y up; pixel (row, column) = (0, 0) is at the top left.
+
+    What lies in front of its near plane or behind its far one, which are across the view at distances `near` and `far` from the eye, is not
+    seen, of the volume and of geometry; a background is. `None` is no plane; a class of somebody's own need not have these fields.
 
     `remainder` is what single precision leaves of a pose that was given in double precision (see `jvr.model.exact`): a camera far away
     from the volume then still aims at the same voxel, and one far from the world's origin stays where it is.
@@ -59,6 +78,14 @@ class AbstractCamera(eqx.Module):
         origin, direction, _ = self.rays_ahead(pixels, jnp.zeros_like(self.world_from_camera[0, 0]))
         return origin, direction
 
+    def limits(self, direction: Triple, ahead: Scalar) -> Limits:
+        """How far from where rays of these directions start (`rays_ahead`) they cross the near and the far plane, each `None` where there
+        is none; differentiable."""
+        back = tuple(self.world_from_camera[i, 2] for i in range(3))
+        along = -dot(direction, back)
+        distance = lambda plane: None if plane is None else (plane - ahead) / along
+        return distance(getattr(self, "near", None)), distance(getattr(self, "far", None))
+
     def axis_at(self, ahead: Scalar) -> Triple:
         """The point of the axis of view at a distance from the eye, to the last digit."""
         matrix, low = self.world_from_camera, self.remainder.beside(self.world_from_camera)
@@ -77,14 +104,17 @@ class PerspectiveCamera(AbstractCamera):
     """A pinhole camera.
 
     **Arguments:** `world_from_camera`: 4x4 rigid transform; `fov_y`: full vertical angle of view in degrees, 0 ... 180;
-    `width`, `height`: pixels (static); `remainder`: of a pose that JAX holds already. Pose and `fov_y` are differentiable.
-    **Raises** `ValueError` for sizes below 1 or an angle out of range.
+    `width`, `height`: pixels (static); `near`, `far`: distances along the view between which the scene is seen, or `None`; `remainder`: of
+    a pose that JAX holds already. All arrays are differentiable. **Raises** `ValueError` for sizes below 1, an angle out of range, or
+    planes that are not in front of each other.
     """
 
     world_from_camera: Affine = parameter(doc="rigid transform")
     fov_y: Scalar = angle_of_view()
     width: int = pixels()
     height: int = pixels()
+    near: Scalar | None = near_plane()
+    far: Scalar | None = far_plane()
     remainder: Remainder = parameter(doc="what single precision leaves of the pose")
 
     def __init__(
@@ -94,18 +124,30 @@ class PerspectiveCamera(AbstractCamera):
         width: int,
         height: int,
         *,
+        near: ArrayLike | None = None,
+        far: ArrayLike | None = None,
         remainder: Remainder | None = None,
     ):
         _place(self, world_from_camera, remainder)
         assign(self, fov_y=fov_y, width=width, height=height)
+        _place_planes(self, near, far)
 
     @classmethod
     def look_at(
-        cls, eye: ArrayLike, target: ArrayLike, up: ArrayLike, fov_y: ArrayLike, width: int, height: int
+        cls,
+        eye: ArrayLike,
+        target: ArrayLike,
+        up: ArrayLike,
+        fov_y: ArrayLike,
+        width: int,
+        height: int,
+        *,
+        near: ArrayLike | None = None,
+        far: ArrayLike | None = None,
     ) -> "PerspectiveCamera":
         """The camera at `eye` that looks at `target`; `up` need not be orthogonal to the view. Traceable, differentiable."""
         pose, remainder = _looking(eye, target, up)
-        return cls(pose, fov_y, width, height, remainder=remainder)
+        return cls(pose, fov_y, width, height, near=near, far=far, remainder=remainder)
 
     def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
         return _through(self, *_plane(self, pixels, 2 * jnp.tan(jnp.deg2rad(self.fov_y) / 2)), ahead)
@@ -119,8 +161,8 @@ class PinholeCamera(AbstractCamera):
     pixels from the upper left corner of the picture, so that the centre of the first pixel is at (0.5, 0.5).
 
     **Arguments:** `world_from_camera`: 4x4 rigid transform; `focal_lengths`: `(f_x, f_y)` in pixels; `principal_point`: `(c_x, c_y)` in
-    pixels, by default the middle of the picture; it may lie outside; `width`, `height`: pixels (static); `remainder`: of a pose that JAX
-    holds already. All arrays are differentiable. **Raises** `ValueError` for sizes below 1 and focal lengths that are not positive.
+    pixels, by default the middle of the picture; it may lie outside; the others as of `PerspectiveCamera`. All arrays are differentiable.
+    **Raises** `ValueError` for sizes below 1, focal lengths that are not positive, or planes that are not in front of each other.
     """
 
     world_from_camera: Affine = parameter(doc="rigid transform")
@@ -128,6 +170,8 @@ class PinholeCamera(AbstractCamera):
     principal_point: Float[Array, "2"] = parameter(doc="column and row, from the upper left corner", unit="pixels")
     width: int = pixels()
     height: int = pixels()
+    near: Scalar | None = near_plane()
+    far: Scalar | None = far_plane()
     remainder: Remainder = parameter(doc="what single precision leaves of the pose")
 
     def __init__(
@@ -138,12 +182,15 @@ class PinholeCamera(AbstractCamera):
         height: int,
         *,
         principal_point: ArrayLike | None = None,
+        near: ArrayLike | None = None,
+        far: ArrayLike | None = None,
         remainder: Remainder | None = None,
     ):
         _place(self, world_from_camera, remainder)
         middle = (width / 2, height / 2) if principal_point is None else principal_point
         # A size of zero would be blamed on the focal length that somebody made of it.
         assign(self, width=width, height=height, focal_lengths=focal_lengths, principal_point=middle)
+        _place_planes(self, near, far)
 
     def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
         row, column = jnp.divmod(pixels, self.width)
@@ -162,6 +209,8 @@ class OrthographicCamera(AbstractCamera):
     height_world: Scalar = parameter(POSITIVE, doc="vertical extent of the picture", unit="mm")
     width: int = pixels()
     height: int = pixels()
+    near: Scalar | None = near_plane()
+    far: Scalar | None = far_plane()
     remainder: Remainder = parameter(doc="what single precision leaves of the pose")
 
     def __init__(
@@ -171,18 +220,30 @@ class OrthographicCamera(AbstractCamera):
         width: int,
         height: int,
         *,
+        near: ArrayLike | None = None,
+        far: ArrayLike | None = None,
         remainder: Remainder | None = None,
     ):
         _place(self, world_from_camera, remainder)
         assign(self, height_world=height_world, width=width, height=height)
+        _place_planes(self, near, far)
 
     @classmethod
     def look_at(
-        cls, eye: ArrayLike, target: ArrayLike, up: ArrayLike, height_world: ArrayLike, width: int, height: int
+        cls,
+        eye: ArrayLike,
+        target: ArrayLike,
+        up: ArrayLike,
+        height_world: ArrayLike,
+        width: int,
+        height: int,
+        *,
+        near: ArrayLike | None = None,
+        far: ArrayLike | None = None,
     ) -> "OrthographicCamera":
         """The camera whose image plane is centred on `eye` and that looks at `target`; traceable, differentiable."""
         pose, remainder = _looking(eye, target, up)
-        return cls(pose, height_world, width, height, remainder=remainder)
+        return cls(pose, height_world, width, height, near=near, far=far, remainder=remainder)
 
     def rays_ahead(self, pixels: Int[Array, "rays"], ahead: Scalar) -> tuple[Triple, Triple, Float[Array, "rays"]]:
         x, y = _plane(self, pixels, self.height_world)
@@ -196,6 +257,13 @@ def _place(camera: Any, world_from_camera: ArrayLike, remainder: Remainder | Non
     """Gives a camera its pose, in its constructor."""
     camera.world_from_camera = affine(world_from_camera, "world_from_camera")
     camera.remainder = Remainder.left(world_from_camera, camera.world_from_camera, remainder)
+
+
+def _place_planes(camera: Any, near: ArrayLike | None, far: ArrayLike | None) -> None:
+    """Gives a camera its planes, in its constructor."""
+    assign(camera, near=near, far=far)
+    if camera.near is not None and camera.far is not None:
+        require(camera.far - camera.near, lambda d: d > 0, "the far plane of a camera must be behind its near plane")
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Affine:

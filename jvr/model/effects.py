@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 from jax.core import Tracer
-from jaxtyping import Array, UInt32
+from jaxtyping import Array, Float, UInt32
 from numpy import ndarray
 
 from jvr.model.kept import content, is_same_content
@@ -85,6 +85,43 @@ class AbstractScattering(AbstractBSDF):
     @abc.abstractmethod
     def scatter_ambient(self) -> Channels:
         """The same per unit of a radiance that comes from everywhere."""
+
+
+class AbstractSurfaces(AbstractPart):
+    """Surfaces that rays meet on their way through a volume."""
+
+    # How many of them a ray passes at most; what is behind the last is not looked for.
+    most: eqx.AbstractVar[int]
+
+    @property
+    def ends_rays(self) -> bool:
+        return True
+
+    @property
+    @abc.abstractmethod
+    def is_opaque(self) -> bool:
+        """Whether each of them ends a ray."""
+
+    def without(self, scene: Any) -> Any:
+        return scene.replaced(surfaces=None)
+
+    @abc.abstractmethod
+    def prepare(self, scene: Any, bricks: Any) -> Any:
+        """What rays need to know to find them, made once for a picture, a pytree; `bricks`: bounds of the volume's bricks, or `None` where
+        none are to be skipped."""
+
+    @abc.abstractmethod
+    def start(self, prepared: Any, rays: Any) -> Any:
+        """The beginning of rays, as `jvr.march.first_hit.Reached`."""
+
+    @abc.abstractmethod
+    def next_hit(self, prepared: Any, rays: Any, reached: Any) -> Any:
+        """Where rays meet one next, as `jvr.march.first_hit.Hits`; differentiable."""
+
+    @abc.abstractmethod
+    def shown(self, medium: Any, rays: Any, hits: Any) -> tuple[Triple, Float[Array, "rays"]]:
+        """Radiance towards the eye of what rays meet in a medium, under the light that reaches it, and how opaque it is; 0 where they meet
+        nothing."""
 
 
 class AbstractShadows(AbstractPart):

@@ -36,13 +36,17 @@ class AbstractGeometry(AbstractPart):
 
     @abc.abstractmethod
     def hit(
-        self, rays: Line, behind: Float[Array, "rays"] | float, pixels: Int[Array, "rays"] | None
+        self,
+        rays: Line,
+        behind: Float[Array, "rays"] | float,
+        nearest: Float[Array, "rays"] | float,
+        pixels: Int[Array, "rays"] | None,
     ) -> tuple[Float[Array, "rays"], Triple]:
         """How far from their origins rays of unit direction end, infinite for those that meet nothing, and the radiance that they see
         there.
 
-        `rays`: in the world; `behind`: how far behind their origins the eye is, in front of which alone anything is met; `pixels`:
-        `row * width + column` of each, `None` for rays that are of no pixel.
+        `rays`: in the world; `behind`: how far behind their origins the eye is; `nearest`: the distance from their origins from which on
+        anything is met; `pixels`: `row * width + column` of each, `None` for rays that are of no pixel.
         """
 
     @abc.abstractmethod
@@ -106,7 +110,11 @@ class DepthImage(AbstractGeometry):
             )
 
     def hit(
-        self, rays: Line, behind: Float[Array, "rays"] | float, pixels: Int[Array, "rays"] | None
+        self,
+        rays: Line,
+        behind: Float[Array, "rays"] | float,
+        nearest: Float[Array, "rays"] | float,
+        pixels: Int[Array, "rays"] | None,
     ) -> tuple[Float[Array, "rays"], Triple]:
         if pixels is None:
             raise ValueError(
@@ -115,4 +123,5 @@ class DepthImage(AbstractGeometry):
             )
         depth, rgb = jnp.ravel(self.depth)[pixels], self.rgb.reshape(-1, 3)[pixels]
         there = (depth > 0) & (depth < jnp.inf)
-        return jnp.where(there, jnp.where(there, depth, 0.0) - behind, jnp.inf), (rgb[:, 0], rgb[:, 1], rgb[:, 2])
+        t = jnp.where(there, jnp.where(there, depth, 0.0) - behind, jnp.inf)
+        return jnp.where(t < nearest, jnp.inf, t), (rgb[:, 0], rgb[:, 1], rgb[:, 2])

@@ -54,6 +54,8 @@ class Interval:
             forms = {"()": f"between {low} and {high}, without either", "(]": f"above {low} and at most {high}"}
             return forms.get(self.ends, f"in {self.ends[0]}{low}, {high}{self.ends[1]}")
         if self.low == 0:
+            if self.takes_infinity:
+                return "positive" if self.ends[0] == "(" else "not negative"
             return "positive and finite" if self.ends[0] == "(" else "finite and not negative"
         if any(bounded):
             return f"finite and {'above' if self.ends[0] == '(' else 'at least'} {self.low:g}"

@@ -16,10 +16,12 @@ from jvr.model.effects import (
     AbstractScattering,
     AbstractShading,
     AbstractShadows,
+    AbstractSurfaces,
 )
 from jvr.model.environment import EnvironmentLight
 from jvr.model.environment_map import EnvironmentMap
 from jvr.model.geometry import AbstractGeometry
+from jvr.model.interpolation import Nearest
 from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
@@ -57,9 +59,11 @@ class Scene(AbstractPart):
     - `geometry`: opaque geometry that rays end at, `jvr.DepthImage`, or `None`.
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
       `jvr.ForwardDifferences()`, `jvr.CentralDifferences()`, `jvr.SobelDifferences()`, `jvr.PrecomputedGradient()`.
+    - `surfaces`: `jvr.Isosurfaces(...)`, shaded as the medium is, or `None`.
 
     **Raises** `ValueError` for shadows without a light, or with nothing that shows light; for occlusion without ambient light, or with
-    nothing that shows it; for one of environment and material without the other, and for radiance transfer without both.
+    nothing that shows it; for one of environment and material without the other, and for radiance transfer without both; for surfaces
+    between nearest voxels, or whose normals are those of the opacity.
     """
 
     volume: Volume = parameter(doc="a jvr.Volume, as jvr.read_volume gives it")
@@ -77,6 +81,7 @@ class Scene(AbstractPart):
     radiance_transfer: AbstractRadianceTransfer | None = parameter(doc="a jvr.RadianceTransfer")
     occlusion: AbstractOcclusion | None = parameter(doc="one of jvr's")
     geometry: AbstractGeometry | None = parameter(doc="a jvr.DepthImage")
+    surfaces: AbstractSurfaces | None = parameter(doc="jvr.Isosurfaces(...)")
 
     def __init__(
         self,
@@ -96,13 +101,15 @@ class Scene(AbstractPart):
         radiance_transfer: AbstractRadianceTransfer | None = None,
         geometry: AbstractGeometry | None = None,
         occlusion: AbstractOcclusion | None = None,
+        surfaces: AbstractSurfaces | None = None,
     ):
         assign(self, volume=volume, transfer=transfer, background=background, optical=optical, clipping=clipping)
         assign(self, lights=lights, shading=shading, shadows=shadows, scattering=scattering, normals=normals)
         assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer, geometry=geometry)
-        assign(self, occlusion=occlusion)
+        assign(self, surfaces=surfaces, occlusion=occlusion)
         _check_light(self)
         _check_environment(self)
+        _check_surfaces(self)
 
     def current(self) -> "Scene":
         """The same scene with nothing in it that was computed for another: `Volume.current()`, and each precomputed part `checked`. What
@@ -233,3 +240,13 @@ def _check_environment(scene: Scene) -> None:
         raise ValueError("a material shows environment lighting: set environment=jvr.EnvironmentLight.from_image(...)")
     if scene.radiance_transfer is not None and not scene.environment_lights:
         raise ValueError("radiance transfer is that of an environment: set environment= and material=, or leave it out")
+
+
+def _check_surfaces(scene: Scene) -> None:
+    """What isosurfaces, and their normals, are of."""
+    if scene.surfaces is None:
+        return
+    if isinstance(scene.volume.interpolation, Nearest):
+        raise ValueError("nearest voxels have no isosurfaces between them: set jvr.Volume(interpolation=jvr.Trilinear())")
+    if scene.normals.of_opacity and scene.needs_gradient:
+        raise ValueError("isosurfaces are lit by the gradient of the scalar: set normals=...(of_opacity=False)")

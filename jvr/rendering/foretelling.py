@@ -161,7 +161,7 @@ def _that_go(variant: Variant, turns: Sequence[Turn], crossed: Sequence[Turn]) -
 def _prepare(scene: Scene, settings: Settings) -> Any:
     (scene,) = near_volume(scene)
     prepared = prepare(scene, settings, step_length(scene, settings))
-    return prepared.occupancy, prepared.visibility, prepared.lighting
+    return prepared.occupancy, prepared.visibility, prepared.lighting, prepared.search
 
 
 def _prepared(variants: Sequence[Variant]) -> list[float]:

@@ -9,6 +9,7 @@ from jvr.march.steps import Rays
 from jvr.model.scene import Scene
 from jvr.rendering.integrator import AbstractRayIntegrator, Radiance
 from jvr.rendering.medium import Prepared, medium
+from jvr.rendering.surfaces import blended_with_surfaces, ended_at_surfaces
 from jvr.rendering.trace import composite, seen_end
 
 
@@ -24,8 +25,16 @@ class Uniform(AbstractRayIntegrator):
     def radiance(self, prepared: Prepared, rays: Rays) -> Radiance:
         settings = prepared.settings
         options = MarchOptions(settings.termination, True)
-        gathered = settings.adjoint.march(options, medium(prepared), rays.without_end, prepared.dt)
-        return radiance_of(prepared.scene, gathered, rays)
+        through, surfaces = medium(prepared), prepared.scene.surfaces
+        if surfaces is None:
+            gathered = settings.adjoint.march(options, through, rays.without_end, prepared.dt)
+            return radiance_of(prepared.scene, gathered, rays)
+        if not surfaces.is_opaque:
+            return blended_with_surfaces(prepared, through, rays)
+        rays, steps = ended_at_surfaces(prepared, through, rays)
+        gathered = settings.adjoint.march(options, through, rays.without_end, prepared.dt)
+        found = radiance_of(prepared.scene, gathered, rays)
+        return found._replace(steps=found.steps + steps)
 
 
 def radiance_of(scene: Scene, gathered: Marched, rays: Rays) -> Radiance:

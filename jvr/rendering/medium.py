@@ -18,12 +18,13 @@ from jvr.march.medium import DENSEST, AbstractVisibility, Medium, Visibilities
 from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.quadrature import PreIntegrated
 from jvr.march.shaders import GradientFrame, LightPathShader, OpticalShader, PreIntegratedShader
-from jvr.model.bricks import bricks_of
+from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbsorptionOnly
 from jvr.model.parts import parts_of
 from jvr.model.preintegration import PreIntegratedTable
 from jvr.model.scene import Scene
+from jvr.model.volume import Volume
 from jvr.types import Scalar
 
 if TYPE_CHECKING:
@@ -39,8 +40,8 @@ class Prepared(NamedTuple):
     - `scene`: near its volume (`jvr.rendering.trace.near_volume`);
     - `settings`: how it is rendered, all but the step, which is 1 here;
     - `dt`: the world length of a segment;
-    - `occupancy`, `visibility`, `lighting`: visible bricks, what is in the way of light, and what the shader of light computes for all
-      rays, each `None` where the scene asks for none.
+    - `occupancy`, `visibility`, `lighting`, `search`: visible bricks, what is in the way of light, what the shader of light computes for
+      all rays, and what these need to find surfaces, each `None` where the scene asks for none.
     """
 
     scene: Scene
@@ -49,6 +50,7 @@ class Prepared(NamedTuple):
     occupancy: Occupancy | None = None
     visibility: AbstractVisibility | None = None
     lighting: Any = None
+    search: Any = None
 
     @property
     def shadow_stats(self) -> Any:
@@ -68,7 +70,10 @@ def prepare(
     occupied = occupancy(scene, settings) if skips else None
     visible = visibility(scene, occupied) if visible is None else visible
     lighting = _lighting().prepare(scene) if scene.shows_light else None
-    return Prepared(scene, dataclasses.replace(settings, step=1.0), dt, occupied, visible, lighting)
+    search = None
+    if scene.surfaces is not None:
+        search = scene.surfaces.prepare(scene, bricks(scene.volume) if settings.skipping else None)
+    return Prepared(scene, dataclasses.replace(settings, step=1.0), dt, occupied, visible, lighting, search)
 
 
 def medium(prepared: Prepared) -> Medium:
@@ -124,14 +129,19 @@ def occupancy(scene: Scene, settings: "Settings") -> Occupancy | None:
     if not settings.skipping:
         return None
     volume = scene.volume
-    bricks = volume.bricks
-    if bricks is None and isinstance(volume.values, Tracer):
-        bricks = bricks_of(jax.lax.stop_gradient(volume.values))
-    elif bricks is None:
-        # Voxels that a traced function closes over are constants; the compiler would fold all of this, and takes seconds for it.
-        with jax.ensure_compile_time_eval():
-            bricks = volume.bricked().bricks
-    assert bricks is not None
     # No ray is longer than the volume's diameter, so that the optical depth of all that is skipped stays below the bound.
     least = jax.lax.stop_gradient(settings.negligible / (2 * volume.radius)) if settings.negligible else None
-    return occupancy_of(bricks, volume.slope, volume.intercept, scene.transfer, least)
+    return occupancy_of(bricks(volume), volume.slope, volume.intercept, scene.transfer, least)
+
+
+def bricks(volume: Volume) -> Bricks:
+    """Bounds of the bricks of a volume: those that it keeps, or made anew."""
+    found = volume.bricks
+    if found is None and isinstance(volume.values, Tracer):
+        return bricks_of(jax.lax.stop_gradient(volume.values))
+    if found is None:
+        # Voxels that a traced function closes over are constants; the compiler would fold all of this, and takes seconds for it.
+        with jax.ensure_compile_time_eval():
+            found = volume.bricked().bricks
+    assert found is not None
+    return found

@@ -9,9 +9,10 @@ from jaxtyping import Array, Float, Int
 
 from jvr.march.march import Marched
 from jvr.march.steps import End, Rays
-from jvr.model.camera import AbstractCamera
-from jvr.model.clipping import interval_inside
+from jvr.model.camera import AbstractCamera, Limits
+from jvr.model.clipping import Line, interval_inside
 from jvr.model.environment_map import EnvironmentMap
+from jvr.model.geometry import AbstractGeometry
 from jvr.model.scene import Scene
 from jvr.numerics import larger, one_minus_exp, smaller
 from jvr.types import Scalar, Triple
@@ -67,19 +68,23 @@ def enter(
     direction: Triple,
     behind: Float[Array, "rays"] | float = 0.0,
     pixels: Int[Array, "rays"] | None = None,
+    limits: Limits = (None, None),
 ) -> tuple[Rays, Float[Array, "rays"]]:
     """World rays inside the volume (and its clipping box), and the distance from the eye, which is `behind` their origin by so much, to
     where they enter.
 
     They end at opaque geometry, and where what is behind differs from ray to ray, they know what they see there. `pixels`: of each, `None`
-    where they are of none (`jvr.model.geometry.AbstractGeometry.hit`). A ray with non-finite numbers gets the length NaN, which
+    where they are of none (`jvr.model.geometry.AbstractGeometry.hit`); `limits`: distances from their origins between which anything is
+    seen. A ray with non-finite numbers gets the length NaN, which
     `composite` turns into a NaN pixel.
     """
     start = scene.volume.grid_from_world(origin)
     along = scene.volume.grid_from_world(direction, direction=True)
     t_in, t_out = interval_inside(scene.volume, scene.clipping, (origin, direction), (start, along))
-    t_in = larger(t_in, -behind)
-    met = None if scene.geometry is None else scene.geometry.hit((origin, direction), behind, pixels)
+    near, far = limits
+    nearest = -behind if near is None else larger(near, -behind)
+    t_in, t_out = larger(t_in, nearest), t_out if far is None else smaller(t_out, far)
+    met = None if scene.geometry is None else _met(scene.geometry, (origin, direction), (behind, nearest, far), pixels)
     t_out = t_out if met is None else smaller(t_out, met[0])
     hit = t_out > t_in
     # Those that miss are counted from the eye.
@@ -91,6 +96,18 @@ def enter(
     start, along = keep(start), keep(along)
     entry = tuple(s + t_in * d for s, d in zip(start, along, strict=True))
     return Rays(entry, along, t_out - t_in + poison, end), jnp.where(hit, behind + t_in, 0.0)
+
+
+def _met(
+    geometry: AbstractGeometry,
+    rays: Line,
+    distances: tuple[Float[Array, "rays"] | float, Float[Array, "rays"] | float, Float[Array, "rays"] | None],
+    pixels: Int[Array, "rays"] | None,
+) -> tuple[Float[Array, "rays"], Triple]:
+    """Where rays meet geometry, no nearer and no farther than the `distances` say, and its radiance there."""
+    behind, nearest, far = distances
+    t, rgb = geometry.hit(rays, behind, nearest, pixels)
+    return t if far is None else jnp.where(t > far, jnp.inf, t), rgb
 
 
 def _end(
@@ -116,7 +133,9 @@ def camera_rays(scene: Scene, camera: AbstractCamera, pixels: Int[Array, "rays"]
     """The rays of some pixels inside the volume, and the distance from the eye to where they enter; scene and camera near the volume."""
     if scene.geometry is not None:
         scene.geometry.check_view(camera)
-    return enter(scene, *camera.rays_ahead(pixels, ahead(scene, camera)), pixels)
+    start = ahead(scene, camera)
+    origin, direction, behind = camera.rays_ahead(pixels, start)
+    return enter(scene, origin, direction, behind, pixels, camera.limits(direction, start))
 
 
 def composite(scene: Scene, gathered: Marched, rays: Rays) -> tuple[Triple, Float[Array, "rays"]]:
@@ -124,10 +143,10 @@ def composite(scene: Scene, gathered: Marched, rays: Rays) -> tuple[Triple, Floa
     transmittances = tuple(jnp.exp(-tau) for tau in gathered.tau)
     zero = jnp.where(jnp.isnan(rays.length), jnp.nan, 0.0)
     rgb = tuple(zero + L for L in gathered.radiance or (0.0, 0.0, 0.0))
-    behind = _behind(scene, rays)
-    if behind is not None:
+    far = behind(scene, rays)
+    if far is not None:
         clear = transmittances * (3 // len(transmittances)) if transmittances else (1.0, 1.0, 1.0)
-        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, behind, strict=True))
+        rgb = tuple(c + T * b for c, T, b in zip(rgb, clear, far, strict=True))
     # Not 1 - T: thin media keep their digits.
     alpha = sum((one_minus_exp(tau) for tau in gathered.tau), zero) / max(len(gathered.tau), 1)
     return rgb, alpha if rays.end is None else alpha + seen_end(gathered, rays.end)
@@ -139,7 +158,7 @@ def seen_end(gathered: Marched, end: End) -> Float[Array, "rays"]:
     return end.opaque * (sum(transmittances, jnp.zeros_like(end.opaque)) / len(transmittances) if transmittances else 1.0)
 
 
-def _behind(scene: Scene, rays: Rays) -> Any:
+def behind(scene: Scene, rays: Rays) -> Any:
     """Radiance behind the medium in three channels, or `None` where there is none."""
     colour, end = scene.background_colour, rays.end
     if end is None:

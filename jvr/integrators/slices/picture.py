@@ -114,6 +114,8 @@ def _table(scene: Scene, settings: Settings) -> LinearTransfer | LutTransfer:
         raise ValueError(f"jvr.Slices() interpolates between samples, which {name}() volumes do not allow: {UNIFORM}")
     if scene.shows_light:
         raise ValueError(f"jvr.Slices() does not know light: {UNIFORM}, or take shading and scattering out of the scene")
+    if scene.surfaces is not None:
+        raise ValueError(f"jvr.Slices() does not know surfaces: {UNIFORM}")
     if scene.geometry is not None:
         raise ValueError(f"jvr.Slices() does not know geometry, at whose edges rays end apart: {UNIFORM}")
     if not isinstance(settings.adjoint, Replay):
@@ -179,7 +181,7 @@ def _level(
     place = lambda n: 2**level * (jnp.arange(n) - 0.5) - 0.5
     row, column = (x.reshape(-1) for x in jnp.meshgrid(place(height), place(width), indexing="ij"))
     origin, direction, behind = plane.rays(column, row)
-    rays, t_in = enter(scene, origin, direction, behind)
+    rays, t_in = enter(scene, origin, direction, behind, limits=plane.limits(direction))
     along = scene.volume.grid_from_world(direction, direction=True)
     starts = jnp.where(rays.length > 0, t_in, behind)
     return column, row, rays, t_in, (starts, *scene.volume.grid_from_world(origin), *along)

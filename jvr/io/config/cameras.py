@@ -79,7 +79,7 @@ def _table_of(camera: AbstractCamera) -> dict[str, Any]:
     lens = {name: getattr(camera, name) for name in declared(type(camera)) if name not in ("world_from_camera", "remainder")}
     # As far away as what it looks at, so that both keep their digits.
     place = {"eye": eye, "target": eye - max(float(np.linalg.norm(eye)), 1.0) * back, "up": pose[:3, 1]}
-    return {"kind": kind, **place, **{n: v if isinstance(v, int) else np.asarray(v) for n, v in lens.items()}}
+    return {"kind": kind, **place, **{n: v if isinstance(v, int) else np.asarray(v) for n, v in lens.items() if v is not None}}
 
 
 def _single(table: SingleTable, center: np.ndarray, corners: np.ndarray) -> AbstractCamera:

@@ -8,7 +8,17 @@ from pydantic import BeforeValidator, Field, model_validator
 from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
 from jvr.io.config.schema.environment import Background, Environments, Geometry, Material, RadianceTransfer
-from jvr.io.config.schema.light import Lights, Normals, Occlusion, OneOrMore, Scattering, Shading, Shadows, casts_shadows
+from jvr.io.config.schema.light import (
+    Lights,
+    Normals,
+    Occlusion,
+    OneOrMore,
+    Scattering,
+    Shading,
+    Shadows,
+    Surfaces,
+    casts_shadows,
+)
 from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, only, part
 from jvr.io.config.schema.table import Extinction, Position, Range, Scalar, Table, one_or_more
 from jvr.io.config.schema.transfer import Transfer
@@ -249,6 +259,7 @@ class ConfigTable(Table):
     shadows: Shadows | None = None
     scattering: Scattering | None = None
     normals: Normals | None = None
+    surfaces: Surfaces | None = None
     environment: Environments = Field(default=[])
     material: Material | None = None
     radiance_transfer: RadianceTransfer | None = None

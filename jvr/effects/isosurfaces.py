@@ -1,0 +1,145 @@
+"""Isosurfaces of the volume: found by `jvr.march.first_hit`, shaded as the medium is, opaque or blended at their place on a ray."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jvr.effects.lighting import LitShader
+from jvr.march.first_hit import FINER, Hits, Reached, Search, next_hit, start, steepest_of
+from jvr.march.medium import Medium
+from jvr.march.occupancy import occupancy_of_values
+from jvr.march.steps import Rays, points_at
+from jvr.model.bricks import Bricks
+from jvr.model.effects import AbstractSurfaces
+from jvr.model.parameters import assign, choice, parameter
+from jvr.model.parts import Knob, PlanEntry, multiples
+from jvr.model.ranges import AT_LEAST_ONE, COLOUR, INCREASING, NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL, Interval
+from jvr.model.scene import Scene
+from jvr.model.transfer import Classified
+from jvr.types import ArrayLike, Scalar, Triple
+
+# Voxels along an edge of a brick that gradients are bounded in.
+BRICK = 4
+
+
+class Isosurfaces(AbstractSurfaces):
+    """Isosurfaces: where the scalar equals one of `values`, hit exactly, in front of, in and behind the medium that the transfer function
+    shows (course notes on GPU-based volume ray-casting, Eurographics 2009, section 2.4).
+
+    Without lights and shading a surface shows its `rgb`; with them it is shaded by the scene's `shading` or `material`, with the normal of
+    its `normals`, and lies in its shadows. Surfaces themselves cast none.
+
+    **Arguments:**
+
+    - `values`: isovalues `(n,)`, ascending; `rgb`: their colours `(n, 3)`.
+    - `opacity`: `(n,)`, 0 ... 1, of each surface, which is blended at its place on a ray: `L <- L1 + T1 (a c + (1 - a) L2)`. `None`: all
+      are opaque, and a ray ends at the first.
+    - `step`: of the samples between which a crossing is looked for, in voxels of the smallest spacing. A sheet that a ray passes within
+      less may be missed.
+    - `band`, `coarse`: where the scalar is at least `band` away from every isovalue, `coarse` samples are one step. No surface is missed
+      for that where `band` is at least `coarse * step` times what the scalar changes by in a voxel. `None`: every sample is taken.
+    - `guaranteed`: steps are instead as long as bounds on the gradient in each brick allow, and `step / 32` at least: what is missed is
+      thinner than that along a ray.
+    - `tolerance`: how near to a crossing its distance is, in voxels.
+    - `most`: surfaces that a ray passes at most, where they are not opaque; of those behind the last nothing is seen.
+
+    Differentiable in values, colours, opacities, voxels and pose, in both modes, by the implicit function theorem, and along surfaces in
+    their normals. Detached: which rays hit. A silhouette moves with what is unknown, and that part of a derivative is missing; next
+    to it distances change infinitely fast, which is limited to a slope of 1000. **Raises** `ValueError` for values that do not
+    ascend and numbers out of range.
+    """
+
+    values: Float[Array, "n"] = parameter(INCREASING, doc="isovalues, ascending", unit="data units")
+    rgb: Float[Array, "n 3"] = parameter(COLOUR, doc="red, green, blue, linear, of each surface")
+    opacity: Float[Array, "n"] | None = parameter(UNIT_INTERVAL, doc="of each surface")
+    band: Scalar | None = parameter(NOT_NEGATIVE, doc="distance from the isovalues at which steps are coarse", unit="data units")
+    step: float = choice(POSITIVE, doc="length of a step", unit="voxels of the smallest spacing", hint="1 is a good start")
+    coarse: int = choice(AT_LEAST_ONE, doc="samples to a coarse step", hint="8 is a good start", most=64)
+    guaranteed: bool = choice(doc="whether steps are bounded by gradients, so that nothing is missed")
+    tolerance: float = choice(Interval(1e-6, 0.5), doc="of a distance", unit="voxels of the smallest spacing")
+    most: int = choice(AT_LEAST_ONE, doc="surfaces that a ray passes", most=64)
+
+    def __init__(
+        self,
+        values: ArrayLike,
+        rgb: ArrayLike,
+        opacity: ArrayLike | None = None,
+        *,
+        step: float | int = 1.0,
+        band: ArrayLike | None = None,
+        coarse: int = 8,
+        guaranteed: bool = False,
+        tolerance: float | int = 1e-4,
+        most: int = 4,
+    ):
+        assign(self, values=values, rgb=rgb, opacity=opacity, band=band, step=step, coarse=coarse)
+        assign(self, guaranteed=guaranteed, tolerance=tolerance, most=most)
+        if guaranteed and band is not None:
+            raise ValueError("guaranteed steps are as long as gradients allow: leave band out, or guaranteed at False")
+
+    @property
+    def is_opaque(self) -> bool:
+        return self.opacity is None
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        n, empty = self.values.shape[0], "; bricks without them are skipped" if settings.skipping else ""
+        many = f"{n} isovalue{'s' * (n != 1)}, " + ("opaque" if self.is_opaque else f"at most {self.most} a ray")
+        rate = f"a sample every {self.step:g} voxels"
+        if self.guaranteed:
+            rate = "steps bounded by gradients"
+        elif self.band is not None:
+            rate = f"a sample every {self.step:g} or {self.coarse * self.step:g} voxels"
+        return (PlanEntry(name, True, f"{many}: {rate}{empty}"),)
+
+    def knobs(self, scene: Any) -> tuple[Knob, ...]:
+        tolerance = multiples("tolerance", self.tolerance, (1000, 100, 10, 1), 1 / 10, least=1e-6, most=0.5)
+        if self.guaranteed:
+            return (tolerance,)
+        coarse = () if self.band is None else (multiples("coarse", self.coarse, (2, 1, 1 / 2, 1 / 4), 1 / 64, least=1, most=64),)
+        return (multiples("step", self.step, (2, 1, 1 / 2), 1 / 4), *coarse, tolerance)
+
+    def prepare(self, scene: Scene, bricks: Bricks | None) -> Search:
+        volume, finer = scene.volume, FINER if self.guaranteed else 1
+        dt = self.step / finer * jnp.min(volume.spacing)
+        occupancy = None if bricks is None else occupancy_of_values(bricks, volume.slope, volume.intercept, self.values)
+        steepest = steepest_of(volume, BRICK) if self.guaranteed else None
+        tolerance = jnp.minimum(self.tolerance * jnp.min(volume.spacing), dt / 2)
+        return Search(volume, self.values, dt, tolerance, occupancy, self.band, steepest, self.coarse)
+
+    def start(self, prepared: Search, rays: Rays) -> Reached:
+        return start(prepared, rays)
+
+    def next_hit(self, prepared: Search, rays: Rays, reached: Reached) -> Hits:
+        return next_hit(prepared, rays, reached)
+
+    def shown(self, medium: Medium, rays: Rays, hits: Hits) -> tuple[Triple, Float[Array, "rays"]]:
+        own = lambda column: jnp.where(hits.found, column[hits.surface], 0.0)
+        colour = tuple(own(self.rgb[:, c]) for c in range(3))
+        opacity = hits.found.astype(rays.length.dtype) if self.opacity is None else own(self.opacity)
+        shader = medium.shader
+        if isinstance(shader, LitShader) and (shader.shading is not None or shader.environment is not None):
+            colour = _lit(shader, medium, rays, hits, colour)
+        return colour, opacity
+
+
+def _lit(shader: LitShader, medium: Medium, rays: Rays, hits: Hits, colour: Triple) -> Triple:
+    """What surfaces of a colour reflect."""
+    # A surface does not scatter as a medium does, and where it is cut there is none of it.
+    shader = LitShader(
+        shader.optical, shader.frame, shader.world_from_grid, shader.lights, shader.shading, None, None, shader.environment
+    )
+    there = lambda x: jnp.where(hits.found, x, 0.0)
+    still = Rays(tuple(map(there, rays.entry)), tuple(map(there, rays.direction)), rays.length)
+    zero = jnp.zeros_like(hits.surface)
+    point = points_at(still, jnp.arange(zero.size, dtype=jnp.int32), zero, hits.u)
+    sample = jax.vmap(medium.field.resample)(point)
+    if medium.visibility is not None:
+        sample = sample._replace(light=medium.visibility.transmittances(point, hits.found, reverse=True))
+    sample = jax.vmap(shader.in_world, in_axes=(None, 0, 0))(medium.transfer, sample, point)
+    classified = Classified(colour, (jnp.zeros_like(hits.u),))
+    none = jnp.zeros((), hits.u.dtype)
+    light_at = lambda sample, point, classified: shader.light_at(sample, point, classified, none, is_surface=True)
+    factor, added = jax.vmap(light_at)(sample, point, classified)
+    return tuple(there(c * a + b) for c, a, b in zip(colour, factor, added, strict=True))

@@ -1,0 +1,377 @@
+"""First hits: where rays cross the isosurfaces of a volume (course notes on GPU-based volume ray-casting, Eurographics 2009, section 2.4).
+
+A ray is sampled at `u_k = k dt`. Between two samples of which one lies below an isovalue and the other not, it crosses that surface. Bricks
+that hold none of the isovalues between their bounds are skipped. Far from all isovalues steps may be larger:
+
+- two rates: where the scalar is at least `band` away from every isovalue, `coarse` samples are one step. A crossing in such a step is
+  looked for again at the finer rate;
+- guaranteed: no crossing is nearer than `|s - rho| / L` along a ray on which the scalar changes by at most `L` per length, which is bounded
+  in each brick.
+
+The crossing is then enclosed ever closer, by interpolation, truncation and projection (Oliveira and Takahashi, "An enhancement of the
+bisection method average performance preserving minmax optimality", ACM TOMS 47:1, 2020): about as many samples as the secant method takes,
+and never more than one more than bisection.
+
+Its derivative is that of the implicit function `s(x(u)) = rho`: `du = (d rho - ds at fixed u) / (grad s . d)`.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jvr.march.occupancy import Occupancy
+from jvr.march.rules import is_there, perturbed
+from jvr.march.steps import Rays, segment_count
+from jvr.march.wavefront import wavefront_while
+from jvr.model.bricks import bricks_of
+from jvr.model.volume import Volume
+from jvr.numerics import divide_or_zero, dot, materialise, turned
+from jvr.types import Scalar
+
+# Skips before a ray is started.
+FIRST_SKIPS = 8
+# Samples of the lattice for each of the base rate, where steps are as long as bounds on the gradient allow.
+FINER = 32
+# A ray that crosses a surface under a smaller angle than this (its sine) has the derivative of this angle.
+LEAST_SINE = 1e-3
+# The fraction of rays that may idle while others are searched, and while crossings are enclosed: both take few steps.
+IDLE_SEARCH, IDLE_ENCLOSED = 0.5, 0.8
+# The side of a point where there are no data.
+MISSING = -1
+
+
+class Search(eqx.Module):
+    """What rays need to know to find the isosurfaces of a volume.
+
+    - `values`: isovalues, ascending; `dt`: world length between two samples; `tolerance`: how closely a crossing is enclosed;
+    - `occupancy`: bricks that may hold an isovalue, or `None` where none are skipped;
+    - `band`: the scalar's distance from the isovalues from which `coarse` samples are one step; `None`: every sample is taken;
+    - `steepest`: bounds on how the scalar changes along each axis of the grid, within a brick and its neighbours; `None`: not known.
+    """
+
+    volume: Volume
+    values: Float[Array, "n"]
+    dt: Scalar
+    tolerance: Scalar
+    occupancy: Occupancy | None
+    band: Scalar | None = None
+    steepest: "Steepest | None" = None
+    coarse: int = eqx.field(static=True, default=1)
+
+    @property
+    def leaps(self) -> bool:
+        """Whether steps may be larger than one sample."""
+        return self.steepest is not None or self.band is not None
+
+    def side(self, s: Float[Array, "rays"]) -> Int[Array, "rays"]:
+        """How many isovalues a scalar has reached."""
+        return sum((s >= value).astype(jnp.int32) for value in self.values)  # pyright: ignore[reportReturnType]
+
+    def sample(self, rays: Rays, u: Float[Array, "rays"]) -> tuple[Float[Array, "rays"], Int[Array, "rays"]]:
+        """The scalar at distances `u`, and the side of the isovalues that it is on."""
+        p = tuple(e + u * d for e, d in zip(rays.entry, rays.direction, strict=True))
+        s = jax.vmap(self.volume.sample)(p)
+        # Else it is sampled anew in each kernel that reads it.
+        s = materialise(rays.length > 0, s)
+        side = self.side(s)
+        return s, side if self.volume.gaps is None else jnp.where(jax.vmap(self.volume.is_known)(p), side, MISSING)
+
+    def skip(self, rays: Rays, k: Int[Array, "rays"]) -> Int[Array, "rays"]:
+        """How many steps from sample `k` on cross no surface."""
+        if self.occupancy is None:
+            return jnp.zeros_like(k)
+        return self.occupancy.skip(rays, jnp.minimum(k * self.dt, rays.length), self.dt, within=True)
+
+    def stride(self, rays: Rays, k: Int[Array, "rays"], s: Float[Array, "rays"]) -> Int[Array, "rays"]:
+        """How many samples are one step from sample `k` on, where the scalar is `s`."""
+        distance = jnp.min(jnp.stack([jnp.abs(s - value) for value in self.values]), axis=0)
+        if self.steepest is None:
+            assert self.band is not None
+            return jnp.where(distance >= self.band, self.coarse, 1)
+        return self.steepest.stride(rays, jnp.minimum(k * self.dt, rays.length), distance, self.dt)
+
+
+class Steepest(eqx.Module):
+    """Bounds on how the scalar changes along each axis of the grid, anywhere in a brick of `size^3` voxels and in those next to it."""
+
+    bounds: tuple[Float[Array, "bx by bz"], ...]
+    size: int = eqx.field(static=True)
+
+    def stride(self, rays: Rays, u: Float[Array, "rays"], distance: Float[Array, "rays"], dt: Scalar) -> Int[Array, "rays"]:
+        """How many steps of length `dt` may be taken from distance `u` on without a change of the scalar by `distance`."""
+        shape = self.bounds[0].shape
+        p = (e + u * d for e, d in zip(rays.entry, rays.direction, strict=True))
+        brick = tuple(jnp.clip(jnp.floor(x / self.size), 0, n - 1).astype(jnp.int32) for x, n in zip(p, shape, strict=True))
+        along = [jnp.abs(d) for d in rays.direction]
+        slope = sum((d * bound[brick] for d, bound in zip(along, self.bounds, strict=True)), jnp.zeros_like(u))
+        # No further than the bricks that the bound is of.
+        farthest = divide_or_zero(jnp.full_like(u, self.size), jnp.maximum(jnp.maximum(along[0], along[1]), along[2]))
+        free = jnp.where(slope > 0, jnp.minimum(distance / jnp.where(slope > 0, slope, 1.0), farthest), farthest)
+        return jnp.clip(jnp.floor((1 - 1e-3) * free / dt), 1, 2**20).astype(jnp.int32)
+
+
+def steepest_of(volume: Volume, size: int) -> Steepest:
+    """Bounds on the derivatives of a trilinear interpolant, by differences of neighbouring voxels; one pass over memory for each axis."""
+    values = volume.values.astype(volume.slope.dtype)
+    bounds = []
+    for axis in range(3):
+        change = jnp.abs(
+            jnp.diff(values, axis=axis, append=jax.lax.slice_in_dim(values, values.shape[axis] - 1, None, axis=axis))
+        )
+        largest = bricks_of(change, size).upper
+        around = jax.lax.reduce_window(largest, -jnp.inf, jax.lax.max, (3, 3, 3), (1, 1, 1), "SAME")
+        bounds.append(jnp.abs(volume.slope) * around)
+    return jax.lax.stop_gradient(Steepest(tuple(bounds), size))
+
+
+class Reached(NamedTuple):
+    """Where rays have come to: at distance `u`, between samples `k` and `k + 1`, on a `side` of the isovalues; `on`: whether they go on."""
+
+    u: Float[Array, "rays"]
+    k: Int[Array, "rays"]
+    side: Int[Array, "rays"]
+    on: Bool[Array, "rays"]
+
+
+class Hits(NamedTuple):
+    """Where rays cross a surface next.
+
+    `u`: distance from the entry, 0 where nothing is `found`; `surface`: the index of its isovalue; `reached`: where to go on from; `steps`:
+    samples that were taken.
+    """
+
+    u: Float[Array, "rays"]
+    surface: Int[Array, "rays"]
+    found: Bool[Array, "rays"]
+    reached: Reached
+    steps: Int[Array, "rays"]
+
+
+def start(search: Search, rays: Rays) -> Reached:
+    """The beginning of rays: a few skips on from their entry. Most of those that see nothing end here."""
+    segments = segment_count(rays.length, search.dt)
+    k = jnp.zeros_like(segments)
+    if search.occupancy is not None:
+        k = jax.lax.fori_loop(0, FIRST_SKIPS, lambda _, k: jnp.minimum(k + search.skip(rays, k), segments), k)
+    u = jnp.minimum(k * search.dt, rays.length)
+    return jax.lax.stop_gradient(Reached(u, k, search.sample(rays, u)[1], k < segments))
+
+
+@jax.custom_jvp
+def next_hit(search: Search, rays: Rays, reached: Reached) -> Hits:
+    """The next crossing of an isosurface on each ray, from where it has come to.
+
+    Differentiable in voxels, isovalues and rays, in both modes and any number of times. A ray that meets a surface at an angle below 0.06
+    degrees has the derivative of that angle: at a silhouette it would be infinite. Where the scalar does not change at all it is 0.
+    Detached: which surface is crossed, and whether one is.
+    """
+    found = _brackets(search, rays, reached)
+    u, samples = _enclosed(search, rays, found)
+    surface = jnp.where(found.rises, found.side, found.side - 1)
+    after = jnp.where(found.rises, found.side + 1, found.side - 1)
+    there = found.there
+    return Hits(
+        jnp.where(there, u, 0.0),
+        jnp.where(there, surface, 0),
+        there,
+        Reached(u, found.k, after, there),
+        found.steps + jnp.where(there, samples, 0),
+    )
+
+
+def _rule(primals: tuple[Search, Rays, Reached], tangents: tuple[Search, Rays, Reached]) -> tuple[Hits, Hits]:
+    hits = next_hit(*primals)
+    search, rays, _ = primals
+    of_search, of_rays, _ = perturbed(primals, tangents)
+    zero = lambda x: jax.custom_derivatives.zero_from_primal(x, symbolic_zeros=True)
+    blank = jax.tree.map(zero, hits)
+    moved = (of_search.volume, of_search.values, of_rays.entry, of_rays.direction)
+    if not jax.tree.leaves(moved):
+        return hits, blank
+    arrays = (search.volume, search.values, rays.entry, rays.direction)
+    moving, still = eqx.partition(arrays, is_there(moved))
+
+    def excess(moving):
+        """By how much the scalar where a ray has crossed a surface exceeds its isovalue."""
+        volume, values, entry, direction = eqx.combine(moving, still)
+        p = tuple(jnp.where(hits.found, e + hits.u * d, 0.0) for e, d in zip(entry, direction, strict=True))
+        return jax.vmap(volume.sample)(p) - values[hits.surface]
+
+    change = jax.jvp(excess, (moving,), (moved,))[1]
+    return hits, blank._replace(u=jnp.where(hits.found, -change * _inverse_slope(search.volume, rays, hits), 0.0))
+
+
+next_hit.defjvp(_rule, symbolic_zeros=True)
+
+
+def _inverse_slope(volume: Volume, rays: Rays, hits: Hits) -> Float[Array, "rays"]:
+    """World length along a ray per change of the scalar where it crosses a surface."""
+    p = tuple(jnp.where(hits.found, e + hits.u * d, 0.0) for e, d in zip(rays.entry, rays.direction, strict=True))
+    gradient = jax.vmap(jax.grad(lambda p: volume.sample(p, in_runs=True)))(p)
+    slope, world = dot(gradient, rays.direction), turned(volume.axes_inverse.T, gradient)
+    least = jax.lax.stop_gradient(LEAST_SINE * jnp.sqrt(dot(world, world)))
+    return divide_or_zero(jnp.ones_like(slope), jnp.copysign(jnp.maximum(jnp.abs(slope), least), slope))
+
+
+class _Brackets(NamedTuple):
+    """Between which distances rays cross a surface, if they do; `side`: in front of it."""
+
+    front: Float[Array, "rays"]
+    back: Float[Array, "rays"]
+    side: Int[Array, "rays"]
+    rises: Bool[Array, "rays"]
+    there: Bool[Array, "rays"]
+    k: Int[Array, "rays"]
+    steps: Int[Array, "rays"]
+
+
+class _Far(NamedTuple):
+    """What says how far a ray may go: the scalar of its last sample, where that is `known`, and up to which sample steps are small."""
+
+    s: Float[Array, "rays"]
+    known: Bool[Array, "rays"]
+    fine_until: Int[Array, "rays"]
+
+
+class _Progress(NamedTuple):
+    """The state of a ray that is searched: its last sample and the side of it; `crossed`: one more than the side of the next, where that is
+    another, else 0."""
+
+    k: Int[Array, "rays"]
+    side: Int[Array, "rays"]
+    crossed: Int[Array, "rays"]
+    steps: Int[Array, "rays"]
+    far: _Far | None
+
+
+class _Way(NamedTuple):
+    """A ray, the number of its steps, and where it begins."""
+
+    rays: Rays
+    segments: Int[Array, "rays"]
+    reached: Reached
+
+
+def _brackets(search: Search, rays: Rays, reached: Reached) -> _Brackets:
+    """The pair of samples of each ray that the next surface is between."""
+    segments = jnp.where(reached.on, segment_count(rays.length, search.dt), 0)
+
+    def begin(way: _Way) -> _Progress:
+        zero = jnp.zeros_like(way.reached.k)
+        far = _Far(jnp.zeros_like(way.rays.length), zero > 0, zero) if search.leaps else None
+        return _Progress(way.reached.k, way.reached.side, zero, zero, far)
+
+    def alive(way: _Way, progress: _Progress) -> Bool[Array, "rays"]:
+        return (progress.crossed == 0) & (progress.k < way.segments)
+
+    def advance(way: _Way, progress: _Progress, _: None) -> tuple[_Progress, None]:
+        on = alive(way, progress)
+        skipped = search.skip(way.rays, progress.k)
+        k = jnp.minimum(progress.k + skipped, way.segments)
+        stride = jnp.ones_like(k)
+        far = progress.far
+        if far is not None:
+            may = far.known & (skipped == 0) & (k >= far.fine_until)
+            stride = jnp.where(may, search.stride(way.rays, k, far.s), 1)
+        following = jnp.minimum(k + stride, way.segments)
+        s, side = search.sample(way.rays, jnp.minimum(following * search.dt, way.rays.length))
+        sampled = on & (k < way.segments)
+        crosses = sampled & (side != progress.side) & (side != MISSING) & (progress.side != MISSING)
+        passed = sampled & ~crosses
+        if far is not None:
+            # What a larger step has passed is looked at again.
+            again = crosses & (following > k + 1)
+            crosses = crosses & ~again
+            known = passed | (far.known & (skipped == 0))
+            far = _Far(jnp.where(passed, s, far.s), known, jnp.where(again, following, far.fine_until))
+        k = jnp.where(passed, following, jnp.where(on, k, progress.k))
+        side_before = jnp.where(passed, side, progress.side)
+        crossed = jnp.where(crosses, side + 1, progress.crossed)
+        return _Progress(k, side_before, crossed, progress.steps + sampled, far), None
+
+    work = jnp.where(reached.on, jnp.maximum(segments - reached.k, 0), 0)
+    finish = lambda progress: progress._replace(far=None)
+    found, _ = wavefront_while(alive, advance, begin, finish, _Way(rays, segments, reached), None, work, IDLE_SEARCH)
+    there = found.crossed > 0
+    # The lattice goes on behind a surface; what is in front of it is known.
+    front = jnp.maximum(jnp.minimum(found.k * search.dt, rays.length), jnp.where(reached.on, reached.u, 0.0))
+    back = jnp.minimum((found.k + 1) * search.dt, rays.length)
+    return _Brackets(front, jnp.maximum(front, back), found.side, found.crossed - 1 > found.side, there, found.k, found.steps)
+
+
+class _Enclosed(NamedTuple):
+    """A bracket that is made smaller: its ends, by how much the scalar is below the isovalue at the front, negative, and above it at the
+    back, positive (both with the sign of the crossing); how much of the length that bisection would leave is not used up (`room`)."""
+
+    front: Float[Array, "rays"]
+    back: Float[Array, "rays"]
+    below: Float[Array, "rays"]
+    above: Float[Array, "rays"]
+    room: Float[Array, "rays"]
+    steps: Int[Array, "rays"]
+
+
+class _Crossing(NamedTuple):
+    """What a bracket is made smaller by: the ray, the isovalue, and the sign of the crossing."""
+
+    rays: Rays
+    value: Float[Array, "rays"]
+    sign: Float[Array, "rays"]
+    bracket: _Brackets
+
+
+def _enclosed(search: Search, rays: Rays, found: _Brackets) -> tuple[Float[Array, "rays"], Int[Array, "rays"]]:
+    """The distance of each crossing, and how many samples that took."""
+    least = search.tolerance
+    halvings = jnp.maximum(jnp.ceil(jnp.log2(search.dt / (2 * least))), 0.0)
+    tiny = jnp.finfo(rays.length.dtype).tiny
+    surface = jnp.where(found.rises, found.side, found.side - 1)
+    sign = jnp.where(found.rises, 1.0, -1.0).astype(rays.length.dtype)
+    crossing = _Crossing(rays, search.values[jnp.clip(surface, 0, search.values.size - 1)], sign, found)
+    excess = lambda crossing, u: crossing.sign * (search.sample(crossing.rays, u)[0] - crossing.value)
+
+    def begin(crossing: _Crossing) -> _Enclosed:
+        bracket = crossing.bracket
+        # Which side either end is on is known; rounding has no say in it.
+        below = jnp.minimum(excess(crossing, bracket.front), -tiny)
+        above = jnp.maximum(excess(crossing, bracket.back), tiny)
+        room = jnp.full_like(bracket.front, 2.0 ** (halvings + 1)) * least
+        return _Enclosed(bracket.front, bracket.back, below, above, room, jnp.full_like(bracket.k, 2))
+
+    def alive(_: _Crossing, state: _Enclosed) -> Bool[Array, "rays"]:
+        return (state.back - state.front > 2 * least) & (state.room > least / 4)
+
+    def advance(crossing: _Crossing, state: _Enclosed, _: None) -> tuple[_Enclosed, None]:
+        on, width = alive(crossing, state), state.back - state.front
+        u = _between(state, width, search.dt)
+        found = excess(crossing, u)
+        low = found < 0
+        move = lambda where, new, old: jnp.where(on & where, new, old)
+        front, below = move(low, u, state.front), move(low, found, state.below)
+        back, above = move(~low, u, state.back), move(~low, jnp.maximum(found, tiny), state.above)
+        return _Enclosed(front, back, below, above, jnp.where(on, state.room / 2, state.room), state.steps + on), None
+
+    def finish(state: _Enclosed) -> tuple[Float[Array, "rays"], Int[Array, "rays"]]:
+        return _secant(state), state.steps
+
+    (u, steps), _ = wavefront_while(alive, advance, begin, finish, crossing, None, found.there.astype(jnp.int32), IDLE_ENCLOSED)
+    return u, steps
+
+
+def _secant(state: _Enclosed) -> Float[Array, "rays"]:
+    """Where a straight line between the ends of a bracket crosses."""
+    fraction = state.below / (state.below - state.above)
+    return state.front + jnp.clip(fraction, 0.0, 1.0) * (state.back - state.front)
+
+
+def _between(state: _Enclosed, width: Float[Array, "rays"], dt: Scalar) -> Float[Array, "rays"]:
+    """Where to look next: at the secant's crossing, moved towards the middle by a little, and by as much as bisection's pace asks for."""
+    middle, secant = state.front + width / 2, _secant(state)
+    towards, distance = jnp.sign(middle - secant), jnp.abs(middle - secant)
+    truncation = 0.2 * jnp.square(width) / dt
+    truncated = jnp.where(truncation <= distance, secant + towards * truncation, middle)
+    radius = jnp.maximum(state.room - width / 2, 0.0)
+    return jnp.where(jnp.abs(truncated - middle) <= radius, truncated, middle - towards * radius)

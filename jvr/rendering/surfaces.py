@@ -1,0 +1,121 @@
+"""Rays that meet surfaces on their way: what is behind an opaque one is not marched, others are blended at their place."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jvr.march.march import Marched, MarchOptions
+from jvr.march.medium import Medium
+from jvr.march.segments import channel_counts
+from jvr.march.steps import End, Rays
+from jvr.numerics import one_minus_exp
+from jvr.rendering.integrator import Radiance
+from jvr.rendering.medium import Prepared
+from jvr.rendering.trace import behind
+from jvr.types import Channels
+
+
+def ended_at_surfaces(prepared: Prepared, medium: Medium, rays: Rays) -> tuple[Rays, Int[Array, "rays"]]:
+    """Rays that end where they meet an opaque surface, which is what they see there, and how many samples it took to find it."""
+    surfaces = prepared.scene.surfaces
+    assert surfaces is not None
+    way = rays.without_end
+    hits = surfaces.next_hit(prepared.search, way, surfaces.start(prepared.search, way))
+    rgb, opaque = surfaces.shown(medium, way, hits)
+    end = End(rgb, opaque, hits.u)
+    if rays.end is not None:
+        end = jax.tree.map(lambda near, far: jnp.where(hits.found, near, far), end, rays.end)
+    return rays._replace(length=jnp.where(hits.found, hits.u, rays.length), end=end), hits.steps
+
+
+class _Seen(NamedTuple):
+    """What a ray has brought up to the distance `u`: radiance, and for each channel of optical depth transmittance, opacity and
+    opacity-weighted distance; `on`: whether it goes on."""
+
+    radiance: Channels
+    clear: Channels
+    opacity: Channels
+    distance: Channels
+    u: Float[Array, "rays"]
+    on: Bool[Array, "rays"]
+    reached: Any
+    steps: Int[Array, "rays"]
+
+
+def blended_with_surfaces(prepared: Prepared, medium: Medium, rays: Rays) -> Radiance:
+    """What rays bring through surfaces that they meet: stretches of the medium between them, `L <- L1 + T1 (a c + (1 - a) L2)`."""
+    settings, surfaces = prepared.settings, prepared.scene.surfaces
+    assert surfaces is not None
+    way, options = rays.without_end, MarchOptions(settings.termination, distance=True)
+    zero = jnp.zeros_like(rays.length)
+    n = max(channel_counts(medium, way, prepared.dt)[1], 1)
+    # Not alive, but not to be lost either: a ray that is no number is marched, and brings none.
+    none, start = jnp.zeros_like(rays.length, jnp.int32), surfaces.start(prepared.search, way)
+    seen = _Seen((zero,) * 3, (zero + 1,) * n, (zero,) * n, (zero,) * n, zero, none == 0, start, none)
+
+    def stretch(seen: _Seen, index: Int[Array, ""]) -> tuple[_Seen, None]:
+        on = seen.on & (index < surfaces.most) & seen.reached.on
+        hits = surfaces.next_hit(prepared.search, way, seen.reached._replace(on=on))
+        end = jnp.where(hits.found, hits.u, way.length)
+        entry = tuple(e + seen.u * d for e, d in zip(way.entry, way.direction, strict=True))
+        part = Rays(entry, way.direction, jnp.where(seen.on, end - seen.u, 0.0))
+        gathered = settings.adjoint.march(options, medium, part, prepared.dt)
+        passed = _behind_stretch(seen, gathered)
+        rgb, opacity = surfaces.shown(medium, way, hits)
+        passed = _behind_layer(passed, rgb, opacity, hits.u)
+        # Where nothing absorbs and no surface is opaque a ray goes on for ever.
+        bright = jnp.max(jnp.stack(passed.clear), axis=0) > settings.termination
+        on = seen.on & hits.found & bright
+        assert gathered.steps is not None
+        steps = passed.steps + hits.steps + gathered.steps
+        return passed._replace(u=jnp.where(on, hits.u, passed.u), on=on, reached=hits.reached, steps=steps), None
+
+    seen, _ = jax.lax.scan(stretch, seen, jnp.arange(surfaces.most + 1, dtype=jnp.int32))
+    return _resolved(prepared, rays, seen)
+
+
+def _spread(channels: Channels, n: int) -> Channels:
+    """One channel or three as `n`."""
+    return channels * (n // len(channels))
+
+
+def _behind_stretch(seen: _Seen, gathered: Marched) -> _Seen:
+    """What has been seen behind a stretch of the medium that begins at `seen.u`."""
+    tau = gathered.tau or (jnp.zeros_like(seen.u),)
+    distance = gathered.distance or (jnp.zeros_like(seen.u),)
+    opaque = tuple(map(one_minus_exp, tau))
+    radiance = seen.radiance
+    if gathered.radiance:
+        radiance = tuple(L + T * c for L, T, c in zip(radiance, _spread(seen.clear, 3), gathered.radiance, strict=True))
+    opacity = tuple(a + T * o for a, T, o in zip(seen.opacity, seen.clear, opaque, strict=True))
+    along = (T * (x + seen.u * o) for T, x, o in zip(seen.clear, distance, opaque, strict=True))
+    clear = tuple(T * jnp.exp(-x) for T, x in zip(seen.clear, tau, strict=True))
+    return seen._replace(radiance=radiance, clear=clear, opacity=opacity, distance=tuple(map(jnp.add, seen.distance, along)))
+
+
+def _behind_layer(seen: _Seen, rgb: Channels, opacity: Float[Array, "rays"], u: Float[Array, "rays"]) -> _Seen:
+    """What has been seen behind a layer of a colour and an opacity."""
+    light = (opacity * T * c for T, c in zip(_spread(seen.clear, 3), rgb, strict=True))
+    return seen._replace(
+        radiance=tuple(map(jnp.add, seen.radiance, light)),
+        clear=tuple(T * (1 - opacity) for T in seen.clear),
+        opacity=tuple(a + T * opacity for a, T in zip(seen.opacity, seen.clear, strict=True)),
+        distance=tuple(x + T * opacity * u for x, T in zip(seen.distance, seen.clear, strict=True)),
+    )
+
+
+def _resolved(prepared: Prepared, rays: Rays, seen: _Seen) -> Radiance:
+    """The radiance of rays with what is behind all of it."""
+    far, zero = behind(prepared.scene, rays), jnp.zeros_like(rays.length)
+    if far is not None:
+        seen = seen._replace(
+            radiance=tuple(L + T * b for L, T, b in zip(seen.radiance, _spread(seen.clear, 3), far, strict=True))
+        )
+    if rays.end is not None:
+        seen = _behind_layer(seen, (zero,) * 3, rays.end.opaque, rays.end.distance)
+    mean = lambda channels: sum(channels[1:], channels[0]) / len(channels)
+    poison = jnp.where(jnp.isnan(rays.length), jnp.nan, 0.0)
+    rgb = jnp.stack(seen.radiance, axis=-1) + poison[:, None]
+    return Radiance(rgb, jnp.asarray(mean(seen.opacity)) + poison, jnp.asarray(mean(seen.distance)), seen.steps)
