@@ -1,4 +1,4 @@
-"""From tables to lights, shading, shadows, occlusion, scattering, normals and surfaces. What a configuration does not name is not imported."""
+"""From tables to lights, shading, shadows, occlusion, scattering, normals and surfaces. What is not named is not imported."""
 
 from typing import Any
 
