@@ -15,7 +15,7 @@ from jvr.effects.nodes import AbstractProjection
 from jvr.effects.occlusion import OcclusionVisibility, Reach, fractions_inside, occlusion_visibility, short_rays
 from jvr.march.medium import DENSEST, LightPath, Medium
 from jvr.march.secondary import take_midpoint
-from jvr.model.clipping import ClippingBox
+from jvr.model.clipping import Clipping
 from jvr.model.effects import AbstractOcclusion, stale_message
 from jvr.model.grids import Shape, node_shape
 from jvr.model.parameters import assign, choice, parameter
@@ -167,7 +167,8 @@ class HistogramOcclusion(AbstractOcclusion):
         positions, at = histograms.positions, (jnp.arange(2 * LOOKS + 1, dtype=histograms.positions.dtype) - LOOKS) / (LOOKS + 1)
         hat = (1 - jnp.abs(at)) / jnp.sum(1 - jnp.abs(at))
         scalars = jnp.clip(positions[:, None] + at * (positions[1] - positions[0]), positions[0], positions[-1])
-        rgb, sigma_t = jax.vmap(jax.vmap(scene.transfer.evaluate))(scalars)
+        classified = jax.vmap(jax.vmap(scene.transfer.evaluate))(scalars)
+        rgb, sigma_t = classified.rgb, classified.sigma_t
         grain = GRAIN * jnp.min(scene.volume.spacing) if self.grain is None else self.grain
         # The mean extinction of a grain: so much of it as it takes of what goes through it.
         rho = [sigma * mean_transmittance(sigma * grain) for sigma in (jnp.minimum(s, DENSEST / grain) for s in sigma_t)]
@@ -186,7 +187,7 @@ class HistogramProjection(AbstractProjection):
     """All that the histograms of a scene are made with, `rays` rays from each node. `scalars`: of the bins."""
 
     volume: Volume
-    clipping: ClippingBox | None
+    clipping: Clipping
     medium: Medium
     reach: Reach
     scalars: Float[Array, "bins"]

@@ -19,7 +19,7 @@ from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.rules import perturbed
 from jvr.march.secondary import SecondaryRays, channel_count, secondary_rays, take_midpoint
 from jvr.march.steps import Point, Transmittances
-from jvr.model.clipping import ClippingBox
+from jvr.model.clipping import Clipping
 from jvr.model.effects import AbstractOcclusion, stale_message
 from jvr.model.grids import Shape, node_shape, nodes_for_each_voxel, resampled_cubic
 from jvr.model.parameters import assign, choice, parameter
@@ -205,7 +205,7 @@ class OcclusionProjection(AbstractProjection):
     reach_of_nodes: ClassVar[int] = 2
 
     volume: Volume
-    clipping: ClippingBox | None
+    clipping: Clipping
     medium: Medium
     reach: Reach
     rays: int = eqx.field(static=True)
@@ -228,7 +228,7 @@ class OcclusionProjection(AbstractProjection):
         return (taken(self, p),)
 
 
-def short_rays(volume: Volume, clipping: ClippingBox | None, number: int, p: Float[Array, "nodes 3"]) -> SecondaryRays:
+def short_rays(volume: Volume, clipping: Clipping, number: int, p: Float[Array, "nodes 3"]) -> SecondaryRays:
     """A `number` of rays from each of some grid positions in all directions, those of a position one after the other."""
     dtype = volume.slope.dtype
     origin = tuple(jnp.repeat(c.astype(dtype), number) for c in p.T)

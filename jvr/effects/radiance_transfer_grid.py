@@ -19,7 +19,7 @@ from jvr.effects.radiance_transfer_nodes import project_nodes
 from jvr.execution.devices import over_rays, shares
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point, Transmittances
-from jvr.model.clipping import ClippingBox
+from jvr.model.clipping import Clipping
 from jvr.model.grids import Shape, nodes_for_each_voxel
 from jvr.model.harmonics.algebra import product_matrix
 from jvr.model.harmonics.basis import band_of, basis
@@ -91,7 +91,7 @@ class RadianceTransferProjection(AbstractProjection):
 
     radiance_transfer: RadianceTransfer
     volume: Volume
-    clipping: ClippingBox | None
+    clipping: Clipping
     medium: Medium
     albedo: EnvironmentLighting | None
     surfaces: bool = eqx.field(static=True)

@@ -242,8 +242,8 @@ def without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
         if chosen.among(model, lambda m, part=part: part(m).sources(m.scene)):
             model = eqx.tree_at(part, model, part(model).pinned())
     if chosen.among(model, lambda m: m.scene.volume):
-        kept = lambda m: (m.scene.volume.bricks, m.scene.volume.gradients)
-        model = eqx.tree_at(kept, model, (None, None), is_leaf=lambda x: x is None)
+        kept = lambda m: (m.scene.volume.bricks, m.scene.volume.gradients, m.scene.volume.sobel_gradients)
+        model = eqx.tree_at(kept, model, (None, None, None), is_leaf=lambda x: x is None)
     return model
 
 
