@@ -57,7 +57,7 @@ class Scene(AbstractPart):
     - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
     - `occlusion`: how much of the ambient light the medium near a point takes away: `jvr.LocalOcclusion(...)`,
       `jvr.HistogramOcclusion(...)`, or `None`: nothing.
-    - `geometry`: opaque geometry that rays end at, `jvr.DepthImage`, or `None`.
+    - `geometry`: opaque geometry that rays end at, `jvr.DepthImage`, `jvr.Mesh`, or `None`.
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
       `jvr.ForwardDifferences()`, `jvr.CentralDifferences()`, `jvr.SobelDifferences()`, `jvr.PrecomputedGradient()`.
     - `surfaces`: `jvr.Isosurfaces(...)`, shaded as the medium is, or `None`.
@@ -84,7 +84,7 @@ class Scene(AbstractPart):
     material: AbstractMaterial | None = parameter(doc="one of jvr's")
     radiance_transfer: AbstractRadianceTransfer | None = parameter(doc="a jvr.RadianceTransfer")
     occlusion: AbstractOcclusion | None = parameter(doc="one of jvr's")
-    geometry: AbstractGeometry | None = parameter(doc="a jvr.DepthImage")
+    geometry: AbstractGeometry | None = parameter(doc="a jvr.DepthImage or a jvr.Mesh")
     surfaces: AbstractSurfaces | None = parameter(doc="jvr.Isosurfaces(...)")
 
     def __init__(
