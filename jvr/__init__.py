@@ -8,6 +8,7 @@ from jvr.names import NAMES
 if TYPE_CHECKING:
     from jvr.effects.deep_shadow_map import DeepShadowMap as DeepShadowMap
     from jvr.effects.isosurfaces import Isosurfaces as Isosurfaces
+    from jvr.effects.phenomenological import PhenomenologicalBSDF as PhenomenologicalBSDF
     from jvr.effects.radiance_transfer import MaterialBleeding as MaterialBleeding
     from jvr.effects.radiance_transfer import RadianceTransfer as RadianceTransfer
     from jvr.effects.radiance_transfer import TransferBleeding as TransferBleeding
@@ -80,6 +81,7 @@ if TYPE_CHECKING:
     from jvr.model.camera import fibonacci_sphere as fibonacci_sphere
     from jvr.model.camera import orbit as orbit
     from jvr.model.clipping import ClippingBox as ClippingBox
+    from jvr.model.clipping import ClippingPlane as ClippingPlane
     from jvr.model.dipole import Dipole as Dipole
     from jvr.model.environment import EnvironmentLight as EnvironmentLight
     from jvr.model.environment_map import EnvironmentMap as EnvironmentMap
@@ -87,6 +89,7 @@ if TYPE_CHECKING:
     from jvr.model.gradient_transfer import GradientOpacity as GradientOpacity
     from jvr.model.gradient_transfer import GradientTransfer as GradientTransfer
     from jvr.model.interpolation import Nearest as Nearest
+    from jvr.model.interpolation import Tricubic as Tricubic
     from jvr.model.interpolation import Trilinear as Trilinear
     from jvr.model.light import AmbientLight as AmbientLight
     from jvr.model.light import DirectionalLight as DirectionalLight

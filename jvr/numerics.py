@@ -1,5 +1,6 @@
 """Numerical primitives: functions with a delicate limit, and their derivatives; reads and writes that the compiler does well."""
 
+import math
 from typing import TypeVar
 
 import jax
@@ -63,6 +64,39 @@ def _one_minus_exp_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[A
     return one_minus_exp(tau), jnp.exp(-tau) * tangent
 
 
+@jax.custom_jvp
+def attenuated(j: Float[Array, "*n"], sigma_t: Float[Array, "*n"], dt: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """What leaves a segment of constant emission and extinction, `j dt phi1(sigma_t dt)`, `phi1(d) = (1 - exp(-d)) / d`.
+
+    Its derivative in `dt`, `j exp(-sigma_t dt)`, keeps its digits for opaque segments, and that in `sigma_t` for thin ones.
+    """
+    return j * dt * _phi1(sigma_t * dt)
+
+
+@attenuated.defjvp
+def _attenuated_jvp(primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    (j, sigma_t, dt), (dj, dsigma, ddt) = primals, tangents
+    depth = sigma_t * dt
+    through = dt * _phi1(depth)
+    return j * through, through * dj + j * dt * (dt * _phi1_slope(depth)) * dsigma + j * jnp.exp(-depth) * ddt
+
+
+def _phi1(depth: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    negligible = jnp.abs(depth) < jnp.finfo(depth.dtype).tiny
+    return jnp.where(negligible, 1.0, one_minus_exp(depth) / jnp.where(negligible, 1.0, depth))
+
+
+def _phi1_slope(depth: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """`(exp(-d) - phi1(d)) / d`; below 1, where that cancels, by its series, the sum of `(-1)^k k d^(k-1) / (k + 1)!`."""
+    thin = jnp.abs(depth) < 1
+    d = jnp.where(thin, depth, 0.0)
+    series = jnp.zeros_like(d)
+    for k in range(17, 0, -1):
+        series = series * d + (-1) ** k * k / math.factorial(k + 1)
+    thick = jnp.where(thin, 1.0, depth)
+    return jnp.where(thin, series, (jnp.exp(-thick) - _phi1(thick)) / thick)
+
+
 def mean_depth(tau: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Where the emission that leaves a homogeneous segment of optical depth `tau` comes from on average, as a fraction of its length:
     `1 / tau - 1 / (exp(tau) - 1)`, from 1/2 for a thin segment towards 0 for an opaque one.
@@ -101,6 +135,18 @@ def direction_and_length(vector: Triple) -> tuple[Triple, Float[Array, "..."]]:
 def turned(matrix: Float[Array, "3 3"], x: Triple) -> Triple:
     """A matrix times a vector."""
     return tuple(sum((matrix[i, j] * x[j] for j in range(3)), jnp.zeros_like(x[i])) for i in range(3))
+
+
+def inverse_of_axes(axes: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """The inverse of a matrix whose columns are axes.
+
+    Its rows are cross products of the axes, each scaled to unit length first: a ratio of 1 : 1000 of their lengths or a world in
+    kilometres costs no digits, as a general inverse in single precision would.
+    """
+    lengths = jnp.linalg.norm(axes, axis=0)
+    a, b, c = (axes / lengths).T
+    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
+    return rows / (jnp.dot(a, rows[0]) * lengths[:, None])
 
 
 def transformed(matrix: Affine, p: Triple) -> Triple:

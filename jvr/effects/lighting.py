@@ -20,8 +20,10 @@ from jvr.effects.shading import surface_weight
 from jvr.march.shaders import GradientFrame, OpticalShader, PreIntegratedShader, where_known
 from jvr.march.steps import Point, Sample
 from jvr.model.by_value import at_value
+from jvr.model.clipping import parts_of_clipping
 from jvr.model.effects import AbstractScattering, AbstractShading
 from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
+from jvr.model.optical import with_own
 from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
 from jvr.numerics import direction_and_length, transformed, turned
@@ -40,7 +42,7 @@ def lit_shader(
     kind = LitPreIntegratedShader if pre_integrated else LitShader
     cut, volume = None, scene.volume
     if scene.clipping is not None and frame is not None:
-        cut = CutFaces(scene.clipping, jnp.min(volume.spacing))
+        cut = CutFaces(parts_of_clipping(scene.clipping), jnp.min(volume.spacing))
     return kind(scene.optical, frame, volume.world_from_grid, scene.lights, scene.shading, scene.scattering, cut, prepared)
 
 
@@ -57,7 +59,8 @@ class LitShader(OpticalShader):
     def shade(self, classified: Classified, sample: Sample, point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         factor, added = self.light_at(sample, point, classified, dt)
         rgb = tuple(c * a + b for c, a, b in zip(classified.rgb, factor, added, strict=True))
-        return self.optical.evaluate_segment(Classified(rgb, classified.sigma_t), dt)
+        # What glows by itself needs no light.
+        return self.optical.evaluate_segment(classified._replace(rgb=rgb), dt)
 
     def light_at(
         self, sample: Sample, point: Point, classified: Classified, dt: Scalar, *, is_surface: bool = False
@@ -121,12 +124,12 @@ class LitPreIntegratedShader(LitShader, PreIntegratedShader):
 
     def evaluate_segment(self, transfer: Any, samples: tuple[Sample, ...], point: Point, dt: Scalar) -> tuple[Channels, Channels]:
         front, back = samples
-        emitted, dtau = transfer.evaluate_segment(self.optical, front.s, back.s, dt)
+        emitted, own, dtau = transfer.evaluate_apart(self.optical, front.s, back.s, dt)
         middle = self.in_world(transfer.table, _mean(front, back), point)
         factor, added = self.light_at(middle, point, transfer.evaluate(middle.s), dt)
         # A constant colour of the given optical depth.
         extra, _ = self.optical.evaluate_segment(Classified(added, dtau), jnp.ones_like(dt))
-        radiance = tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False))
+        radiance = with_own(tuple(e * a + b for e, a, b in zip(emitted, factor, extra, strict=False)), own)
         return where_known(samples, radiance), where_known(samples, dtau)
 
 

@@ -20,7 +20,7 @@ from jvr.execution.devices import over_rays, shares
 from jvr.execution.tiles import dealt, joined
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point, Transmittances
-from jvr.model.clipping import ClippingBox
+from jvr.model.clipping import Clipping
 from jvr.model.harmonics.algebra import product_matrix
 from jvr.model.harmonics.basis import band_of, basis
 from jvr.model.scene import Scene
@@ -92,7 +92,7 @@ class RadianceTransferProjection(eqx.Module):
 
     radiance_transfer: RadianceTransfer
     volume: Volume
-    clipping: ClippingBox | None
+    clipping: Clipping
     medium: Medium
     albedo: EnvironmentLighting | None
     surfaces: bool = eqx.field(static=True)

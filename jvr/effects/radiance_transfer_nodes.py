@@ -17,7 +17,7 @@ from jvr.effects.shading import surface_weight
 from jvr.march.medium import Medium
 from jvr.march.secondary import SecondaryRays, channel_count, points, secondary_rays, take_midpoint
 from jvr.march.segments import classify_at
-from jvr.model.clipping import ClippingBox
+from jvr.model.clipping import Clipping
 from jvr.model.harmonics.basis import basis
 from jvr.model.volume import Volume
 from jvr.numerics import direction_and_length, one_minus_exp, perpendicular
@@ -51,7 +51,7 @@ def node_positions(volume: Volume, shape: tuple[int, int, int]) -> np.ndarray:
 def project_nodes(
     radiance_transfer: RadianceTransfer,
     volume: Volume,
-    clipping: ClippingBox | None,
+    clipping: Clipping,
     medium: Medium,
     albedo: EnvironmentLighting | None,
     surfaces: bool,

@@ -11,7 +11,7 @@ from jvr.march.fields import VoxelField
 from jvr.march.march import Marched, MarchOptions, march
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Rays, Transmittances
-from jvr.model.clipping import ClippingBox, interval_inside
+from jvr.model.clipping import Clipping, interval_inside
 from jvr.model.effects import AbstractShadows
 from jvr.model.light import AbstractDeltaLight
 from jvr.model.parameters import assign, choice
@@ -56,7 +56,7 @@ class ShadowRays(AbstractShadows):
 class RayVisibility(AbstractVisibility):
     """Visibility by shadow rays to each light through `medium`, which emits nothing; or `None` for lights that nothing shades."""
 
-    clipping: ClippingBox | None
+    clipping: Clipping
     lights: tuple[AbstractDeltaLight | None, ...]
     medium: Medium
     dt: Scalar

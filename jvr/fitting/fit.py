@@ -241,8 +241,8 @@ def without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
     if model.scene.radiance_transfer is not None and chosen.among(model, lambda m: transfer(m).sources(m.scene)):
         model = eqx.tree_at(transfer, model, model.scene.radiance_transfer.pinned())
     if chosen.among(model, lambda m: m.scene.volume):
-        kept = lambda m: (m.scene.volume.bricks, m.scene.volume.gradients)
-        model = eqx.tree_at(kept, model, (None, None), is_leaf=lambda x: x is None)
+        kept = lambda m: (m.scene.volume.bricks, m.scene.volume.gradients, m.scene.volume.sobel_gradients)
+        model = eqx.tree_at(kept, model, (None, None, None), is_leaf=lambda x: x is None)
     return model
 
 

@@ -133,8 +133,8 @@ def _kept(problem: Problem, observations: Observations, keep: bool | int) -> Gro
     if keep is False or moving or not only_scalars or isinstance(problem.loss, DSSIM):
         return Group(problem, observations)
     limit = KEEP_LIMIT if keep is True else keep
-    # Colours and extinctions of a table leave its ends where they are; whatever else it has may move them.
-    entries = lambda transfer: (transfer.rgb, transfer.sigma_t) if isinstance(transfer, AbstractTable) else ()
+    # Entries of a table leave its ends where they are; whatever else it has may move them.
+    entries = lambda transfer: tuple(transfer.entries.values()) if isinstance(transfer, AbstractTable) else ()
     clamped = among(lambda m: m.scene.transfer) == among(lambda m: entries(m.scene.transfer))
     kept = keep_samples(problem.model.scene, observations, problem.settings, limit, clamped=clamped)
     return Group(problem, observations) if kept is None else Group(problem.with_samples(kept[0]), kept[1])

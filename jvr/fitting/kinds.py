@@ -18,10 +18,12 @@ from jvr.model.transfer import AbstractTable
 
 
 class TableEntries(NamedTuple):
-    """Indices of a table's colours and extinctions in the vector of all unknowns, in the shape of either, `None` where they are known."""
+    """Indices of a table's colours, extinctions and emissions in the vector of all unknowns, in the shape of each, `None` where they are
+    known."""
 
     rgb: np.ndarray | None = None
     sigma_t: np.ndarray | None = None
+    emission: np.ndarray | None = None
 
 
 class OfViews(NamedTuple):
@@ -60,17 +62,15 @@ class Kinds(NamedTuple):
     @classmethod
     def of(cls, problem: Problem) -> "Kinds":
         unknowns, model = problem.unknowns, problem.model
-        after, (rgb, sigma_t) = _after_march(problem), _in_table(problem)
+        after, in_table = _after_march(problem), _in_table(problem)
         entries, places, starts = TableEntries(), unknowns.seen_from(model), {}
         outer, inner, directions = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros((0, 3), int)]
         begin, taken = 0, 0
         for i, array in enumerate(unknowns.values(model)):
             indices = np.arange(begin, begin + array.size)
             begin += array.size
-            if i in rgb:
-                entries = entries._replace(rgb=indices.reshape(array.shape))
-            elif i in sigma_t:
-                entries = entries._replace(sigma_t=indices.reshape(array.shape))
+            if i in in_table:
+                entries = entries._replace(**{in_table[i]: indices.reshape(array.shape)})
             elif i in places:
                 starts[i] = int(indices[0])
             elif i in after:
@@ -149,10 +149,11 @@ def has_table_jacobian(scene: Scene) -> bool:
     return isinstance(scene.transfer, AbstractTable) and not shade and not by_gradient
 
 
-def _in_table(problem: Problem) -> tuple[frozenset[int], frozenset[int]]:
-    """Which unknowns are colours and which extinctions of a table, where their derivatives come by rows."""
+def _in_table(problem: Problem) -> dict[int, str]:
+    """Which unknowns are entries of a table, and of which of its fields, where their derivatives come by rows."""
     if not _has_rows(problem):
-        return frozenset(), frozenset()
-    columns = (lambda m: m.scene.transfer.rgb), (lambda m: m.scene.transfer.sigma_t)
-    rgb, sigma_t = (problem.unknowns.among(problem.model, column) for column in columns)
-    return rgb, sigma_t
+        return {}
+    transfer = problem.model.scene.transfer
+    assert isinstance(transfer, AbstractTable)
+    of = lambda name: problem.unknowns.among(problem.model, lambda m: getattr(m.scene.transfer, name))
+    return {i: name for name in transfer.entries for i in of(name)}

@@ -293,8 +293,8 @@ def _jacobian(
     if any(indices is not None for indices in kinds.entries):
         prepared, through = observed(model.scene, arrays)
         assert through is not None
-        of_extinctions = kinds.entries.sigma_t is not None
-        gathered, rows = table_jacobian(options, through, rays, prepared.dt, of_extinctions=of_extinctions)
+        beside = [name for name in ("sigma_t", "emission") if getattr(kinds.entries, name) is not None]
+        gathered, rows = table_jacobian(options, through, rays, prepared.dt, of=beside)
         _add_entries(model, gathered, rows, rays, kinds.entries, blocks)
     if kinds.inner.size:
         point = (values[kinds.inner], arrays)
@@ -365,6 +365,8 @@ def _add_entries(
     for c in range(3):
         if entries.rgb is not None and rows.radiance_rgb:
             blocks[c].append((rows.radiance_rgb[c] * by_radiance[c][:, None], entries.rgb[:, c]))
+        if entries.emission is not None and rows.radiance_emission:
+            blocks[c].append((rows.radiance_emission[c] * by_radiance[c][:, None], entries.emission[:, c]))
         if sigma_t is not None:
             block = jnp.zeros((rays.length.shape[0], sigma_t.shape[0]), rays.length.dtype)
             if rows.radiance_sigma:

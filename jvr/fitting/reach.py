@@ -55,6 +55,7 @@ def _brightest(problem: Problem) -> float | None:
     """The most that a pixel can have, `None` where nothing bounds it: a mean of colours of the table and the background."""
     scene, unknowns = problem.model.scene, problem.unknowns
     bounded = isinstance(scene.transfer, AbstractTable) and isinstance(scene.optical, EmissionAbsorption | AbsorptionOnly)
+    bounded &= getattr(scene.transfer, "emission", None) is None
     if not bounded or scene.shows_light or scene.ends_rays or problem.model.exposure is not None:
         return None
     highest = 0.0

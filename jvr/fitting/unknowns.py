@@ -200,7 +200,7 @@ def _range_of_voxels(model: ExposedModel, indices: tuple[int, ...]) -> Interval 
     transfer, volume = model.scene.transfer, model.scene.volume
     if not isinstance(transfer, AbstractTable):
         return None
-    of_table: Any = lambda m: (m.scene.transfer.rgb, m.scene.transfer.sigma_t)
+    of_table: Any = lambda m: tuple(m.scene.transfer.entries.values())
     placed = _among_leaves(model, lambda m: (m.scene.transfer, m.scene.volume.slope, m.scene.volume.intercept))
     if set(indices) & (placed - _among_leaves(model, of_table)):
         return None

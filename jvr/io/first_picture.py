@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jvr.io.config.transfers import LABEL_DEPTH, contents
 from jvr.io.interop.slicer import slicer_presets, slicer_property
@@ -22,6 +22,7 @@ from jvr.io.volumes.zarr_files import is_zarr
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
 from jvr.model.voxels import typical_range
+from jvr.types import Scalar
 
 # Formats that say how a patient lies; others say nothing of what is up.
 ORIENTED = (".nii", ".nii.gz", ".hdr", ".img", ".dcm", ".nrrd", ".nhdr")
@@ -89,7 +90,10 @@ def _says_what_is_up(path: Path) -> bool:
 
 @eqx.filter_jit
 def _fraction_seen(transfer: AbstractTransfer, data: Float[Array, "n"]) -> Float[Array, ""]:
-    seen = lambda s: jnp.max(jnp.asarray(transfer.evaluate(s, jnp.zeros_like(s)).sigma_t)) > 0
+    def seen(s: Scalar) -> Bool[Array, ""]:
+        found = transfer.evaluate(s, jnp.zeros_like(s))
+        return jnp.max(jnp.asarray((*found.sigma_t, *found.emission))) > 0
+
     return jnp.mean(jax.vmap(seen)(data))
 
 

@@ -11,6 +11,7 @@ from jvr.integrators.slices.oracle import AbstractOracle
 from jvr.march.differentiation import AbstractAdjoint
 from jvr.march.quadrature import AbstractQuadrature
 from jvr.model.camera import AbstractCamera
+from jvr.model.clipping import AbstractClipping
 from jvr.model.effects import (
     AbstractBleeding,
     AbstractRadianceTransfer,
@@ -47,7 +48,12 @@ KINDS: dict[type, dict[str, str]] = {
         "head": "HeadLight",
         "ambient": "AmbientLight",
     },
-    AbstractShading: {"lambert": "Lambert", "phong": "Phong", "blinn-phong": "BlinnPhong"},
+    AbstractShading: {
+        "lambert": "Lambert",
+        "phong": "Phong",
+        "blinn-phong": "BlinnPhong",
+        "phenomenological": "PhenomenologicalBSDF",
+    },
     AbstractShadows: {
         "rays": "ShadowRays",
         "volume": "ShadowVolume",
@@ -101,7 +107,8 @@ KINDS: dict[type, dict[str, str]] = {
         "emission-only": "EmissionOnly",
         "absorption-only": "AbsorptionOnly",
     },
-    AbstractInterpolation: {"trilinear": "Trilinear", "nearest": "Nearest"},
+    AbstractClipping: {"box": "ClippingBox", "plane": "ClippingPlane"},
+    AbstractInterpolation: {"trilinear": "Trilinear", "tricubic": "Tricubic", "nearest": "Nearest"},
     AbstractCamera: {
         "perspective": "PerspectiveCamera",
         "orthographic": "OrthographicCamera",

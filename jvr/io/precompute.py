@@ -113,8 +113,8 @@ _projected = jax.jit(lambda material, order: material.projected(order), static_a
 
 def _bare(volume: Volume) -> Volume:
     """The volume without what it keeps of its voxels."""
-    kept = lambda v: (v.bricks, v.squares, v.gradients)
-    return eqx.tree_at(kept, volume, (None, None, None), is_leaf=lambda x: x is None)
+    kept = lambda v: (v.bricks, v.squares, v.gradients, v.sobel_gradients)
+    return eqx.tree_at(kept, volume, (None, None, None, None), is_leaf=lambda x: x is None)
 
 
 def as_precomputed(scene: Scene) -> Scene:

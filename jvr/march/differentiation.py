@@ -15,7 +15,7 @@ from jvr.march.medium import Medium, taking_all
 from jvr.march.rules import FORWARDS, forwards_only, is_there, perturbed, skipping
 from jvr.march.steps import Rays
 from jvr.model.parts import AbstractPart, PlanEntry
-from jvr.model.transfer import AbstractTable, AbstractTransfer
+from jvr.model.transfer import ENTRIES, AbstractTable, AbstractTransfer
 from jvr.types import Scalar
 
 
@@ -80,7 +80,8 @@ def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tup
     if options.distance or not jax.tree.leaves(entries):
         primal, tangent = _march(options, *primals), None
     else:
-        primal, rows = _table_jacobian((options, entries.sigma_t is not None), medium, rays, dt)
+        beside = tuple(name for name in entries.entries if name != "rgb")
+        primal, rows = _table_jacobian((options, beside), medium, rays, dt)
         tangents = (tangents[0]._replace(transfer=rest_of_transfer), *tangents[1:])
         tangent = _times_entries(primal, rows, entries)
     if jax.tree.leaves(tangents):
@@ -94,22 +95,23 @@ def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tup
 
 _jacobian_march.defjvp(_jacobian_rule, symbolic_zeros=True)
 _march = skipping(march, FORWARDS)
-_table_jacobian = skipping(lambda options, *inputs: table_jacobian(options[0], *inputs, of_extinctions=options[1]), FORWARDS)
+_table_jacobian = skipping(lambda options, *inputs: table_jacobian(options[0], *inputs, of=options[1]), FORWARDS)
 
 
 def _split_entries(tree: AbstractTransfer) -> tuple[Any, Any]:
-    """The same tree twice: without the entries of a table (its colours and extinctions), and with nothing but them."""
-    if not isinstance(tree, AbstractTable):
-        return tree, jax.tree.map(lambda _: None, tree)
-    rest = eqx.tree_at(lambda t: (t.rgb, t.sigma_t), tree, (None, None), is_leaf=lambda x: x is None)
+    """The same tree twice: without the entries of a table (its colours, extinctions and emissions), and with nothing but them."""
     nothing = jax.tree.map(lambda _: None, tree)
-    entries = eqx.tree_at(lambda t: (t.rgb, t.sigma_t), nothing, (tree.rgb, tree.sigma_t), is_leaf=lambda x: x is None)
-    return rest, entries
+    if not isinstance(tree, AbstractTable) or not tree.entries:
+        return tree, nothing
+    found = tree.entries
+    pick = lambda t: [getattr(t, name) for name in found]
+    rest = eqx.tree_at(pick, tree, [None] * len(found))
+    return rest, eqx.tree_at(pick, nothing, list(found.values()), is_leaf=lambda x: x is None)
 
 
 def _times_entries(primal: Marched, rows: TableJacobian, tangent: Any) -> Marched:
     """Rows of a table times a direction in its entries; optical depths depend on extinctions alone, and have no rows without them."""
-    rgb, sigma_t = tangent.rgb, tangent.sigma_t
+    rgb, sigma_t, emission = (tangent.entries.get(name) for name in ENTRIES)
     sigma_column = lambda c: sigma_t if sigma_t.ndim == 1 else sigma_t[:, c]
     radiance, tau = [[jnp.zeros_like(x) for x in channels] for channels in (primal.radiance, primal.tau)]
     for c in range(len(radiance)):
@@ -117,6 +119,8 @@ def _times_entries(primal: Marched, rows: TableJacobian, tangent: Any) -> Marche
             radiance[c] += rows.radiance_rgb[c] @ rgb[:, c]
         if sigma_t is not None:
             radiance[c] += rows.radiance_sigma[c] @ sigma_column(c)
+        if emission is not None:
+            radiance[c] += rows.radiance_emission[c] @ emission[:, c]
     for c, of_entries in enumerate(rows.tau_sigma):
         tau[c] += of_entries @ sigma_column(c)
     return Marched(tuple(radiance), tuple(tau), (), None)

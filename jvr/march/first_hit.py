@@ -114,7 +114,9 @@ class Steepest(eqx.Module):
 
 
 def steepest_of(volume: Volume, size: int) -> Steepest:
-    """Bounds on the derivatives of a trilinear interpolant, by differences of neighbouring voxels; one pass over memory for each axis."""
+    """Bounds on the derivatives of the interpolant, means of differences of neighbouring voxels; one pass over memory for each axis."""
+    # Of a brick and those next to it; a spline is made of voxels beyond these, too.
+    width = 5 if volume.interpolation.reach else 3
     values = volume.values.astype(volume.slope.dtype)
     bounds = []
     for axis in range(3):
@@ -122,7 +124,7 @@ def steepest_of(volume: Volume, size: int) -> Steepest:
             jnp.diff(values, axis=axis, append=jax.lax.slice_in_dim(values, values.shape[axis] - 1, None, axis=axis))
         )
         largest = bricks_of(change, size).upper
-        around = jax.lax.reduce_window(largest, -jnp.inf, jax.lax.max, (3, 3, 3), (1, 1, 1), "SAME")
+        around = jax.lax.reduce_window(largest, -jnp.inf, jax.lax.max, (width, width, width), (1, 1, 1), "SAME")
         bounds.append(jnp.abs(volume.slope) * around)
     return jax.lax.stop_gradient(Steepest(tuple(bounds), size))
 

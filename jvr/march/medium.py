@@ -112,14 +112,15 @@ def for_derivatives(medium: Medium, wanted: Medium, moved: Any = None) -> Medium
     """What a march goes through that is differentiated in the leaves of `wanted` that are not `None`, and with `moved`, of rays or steps,
     in where samples lie.
 
-    An empty brick has a derivative in the extinctions of the transfer function, since that at zero is not zero. In what moves samples or
-    the entries of a table it has one only where that may make it visible, and in anything else, such as colours and light, none.
+    An empty brick has a derivative in the extinctions and emissions of the transfer function, since that at zero is not zero. In what
+    moves samples or the entries of a table it has one only where that may make it visible, and in anything else, such as colours and
+    light, none.
     """
     occupancy, transfer = medium.occupancy, wanted.transfer
     if occupancy is None or occupancy.is_bounded:
         return medium
     is_table = isinstance(transfer, AbstractTable)
-    if jax.tree.leaves(transfer.sigma_t if is_table else transfer):
+    if any(name != "rgb" for name in transfer.entries) if is_table else jax.tree.leaves(transfer):
         return medium._replace(occupancy=None)
     of_colours = is_table and transfer.rgb is not None
     moves = len(jax.tree.leaves((transfer, wanted.field, moved))) > of_colours

@@ -1,7 +1,7 @@
 """Empty-space skipping: the bricks that a transfer function leaves empty, and how far rays may skip them.
 
-A brick is empty if no value between its smallest and largest voxel has extinction above a bound, by default zero; without
-extinction nothing is emitted either (`j = sigma_t rgb` in every optical model). Around each empty brick there is a cube of empty
+A brick is empty if no value between its smallest and largest voxel has extinction, or emission of its own, above a bound, by default zero;
+without either nothing is emitted (`j = sigma_t rgb + q` in every optical model). Around each empty brick there is a cube of empty
 bricks, and a ray inside of it goes on with the first sample outside. Samples stay where they are, so a picture with skips and one
 without take the same contributing samples.
 """

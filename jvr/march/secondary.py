@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jvr.march.medium import Medium
 from jvr.march.segments import classify_at
 from jvr.march.steps import Point, Sample
-from jvr.model.clipping import ClippingBox, Line, interval_inside
+from jvr.model.clipping import Clipping, Line, interval_inside
 from jvr.model.transfer import Classified
 from jvr.model.volume import Volume
 from jvr.numerics import larger, rounded_into, smaller
@@ -30,7 +30,7 @@ class SecondaryRays(NamedTuple):
     t_out: Float[Array, "..."]
 
 
-def secondary_rays(volume: Volume, clipping: ClippingBox | None, world: Line, grid: Line) -> SecondaryRays:
+def secondary_rays(volume: Volume, clipping: Clipping, world: Line, grid: Line) -> SecondaryRays:
     """Rays that begin somewhere, in world and grid coordinates, and go on without an end."""
     t_in, t_out = interval_inside(volume, clipping, world, grid)
     hit = t_out > t_in

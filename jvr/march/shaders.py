@@ -69,7 +69,7 @@ class OpticalShader(AbstractShader):
             found = transfer.evaluate(sample.s, direction_and_length(sample.gradient)[1])
         else:
             found = transfer.evaluate(sample.s)
-        return Classified(found.rgb, where_known((sample,), found.sigma_t))
+        return Classified(found.rgb, *(where_known((sample,), channels) for channels in (found.sigma_t, found.emission)))
 
 
 class LightPathShader(OpticalShader):
@@ -78,7 +78,7 @@ class LightPathShader(OpticalShader):
     densest: Scalar
 
     def classify(self, transfer: Any, sample: Sample) -> Classified:
-        rgb, sigma_t = super().classify(transfer, sample)
+        rgb, sigma_t, _ = super().classify(transfer, sample)
         return Classified(rgb, tuple(jnp.minimum(sigma, self.densest) for sigma in sigma_t))
 
 

@@ -49,3 +49,18 @@ def _along(values: Array, axis: int, size: int, extreme: Any) -> Array:
 
     # A run that is longer than the axis holds nothing else.
     return functools.reduce(extreme, [voxel(i) for i in range(min(size, n - 1) + 1)])
+
+
+def widened(bricks: Bricks) -> Bricks:
+    """Bounds of each brick and of all that touch it: of values that are made of voxels up to a brick's size beyond."""
+    lower, upper = bricks.lower, bricks.upper
+    for axis in range(3):
+        lower, upper = _with_neighbours(lower, axis, jnp.minimum), _with_neighbours(upper, axis, jnp.maximum)
+    return Bricks(lower, upper, bricks.size)
+
+
+def _with_neighbours(bounds: Array, axis: int, extreme: Any) -> Array:
+    """Extremes of each element and of both that are next to it along an axis."""
+    padded, n = jnp.pad(bounds, [(1, 1) if a == axis else (0, 0) for a in range(3)], mode="edge"), bounds.shape[axis]
+    before, after = (jax.lax.slice_in_dim(padded, at, at + n, axis=axis) for at in (0, 2))
+    return extreme(bounds, extreme(before, after))

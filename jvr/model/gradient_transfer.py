@@ -1,6 +1,7 @@
 """Transfer functions of the scalar and of the length of its gradient (Kniss, Kindlmann and Hansen 2002; Levoy 1988)."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jvr.model.checks import require
 from jvr.model.parameters import assign, parameter
 from jvr.model.ranges import COLOUR, EXTINCTION, INCREASING, NOT_NEGATIVE
-from jvr.model.transfer import AbstractTransfer, Classified, any_between
+from jvr.model.transfer import AbstractTransfer, Classified, any_between, own_emission, shown_entries
 from jvr.numerics import clamp, larger, smaller
 from jvr.types import ArrayLike, Channels, Scalar
 
@@ -20,7 +21,8 @@ class GradientTransfer(AbstractTransfer):
 
     **Arguments:** `rgb`: `(n, m, 3)`, linear; `sigma_t`: `(n, m)` or, coloured, `(n, m, 3)`, per world length, not negative; `domain`:
     `(low, high)` scalars of the first and last row; `magnitudes`: `(low, high)` lengths of the gradient, in data units per world length,
-    of the first and last column. Values outside count as at the border. All differentiable.
+    of the first and last column; `emission`: `(n, m, 3)`, radiance per world length that the medium emits by itself, or `None`. Values
+    outside count as at the border. All differentiable.
     **Raises** `ValueError` for other shapes and ranges.
     """
 
@@ -30,31 +32,41 @@ class GradientTransfer(AbstractTransfer):
     sigma_t: Float[Array, "..."] = parameter(EXTINCTION, shapes=(("n", "m"), ("n", "m", 3)), doc="extinction", unit="1 / mm")
     domain: Float[Array, "2"] = parameter(INCREASING, doc="low < high in the data's own units")
     magnitudes: Float[Array, "2"] = parameter(INCREASING, doc="low < high, lengths of the gradient", unit="data units per mm")
+    emission: Float[Array, "n m 3"] | None = own_emission(ordered=False)
 
-    def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike, magnitudes: ArrayLike):
-        assign(self, rgb=rgb, sigma_t=sigma_t, domain=domain, magnitudes=magnitudes)
+    def __init__(
+        self,
+        rgb: ArrayLike,
+        sigma_t: ArrayLike,
+        domain: ArrayLike,
+        magnitudes: ArrayLike,
+        emission: ArrayLike | None = None,
+    ):
+        assign(self, rgb=rgb, sigma_t=sigma_t, domain=domain, magnitudes=magnitudes, emission=emission)
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         assert magnitude is not None
         n, m, _ = self.rgb.shape
-        table = jnp.concatenate([self.rgb, self.sigma_t.reshape(n, m, -1)], axis=-1)
+        emission = () if self.emission is None else (self.emission,)
+        table = jnp.concatenate([self.rgb, self.sigma_t.reshape(n, m, -1), *emission], axis=-1)
         (i, x), (j, y) = _cell(s, self.domain, n), _cell(magnitude, self.magnitudes, m)
         rows = [table[i + a, j + b] * ((x if a else 1 - x) * (y if b else 1 - y)) for a in (0, 1) for b in (0, 1)]
-        r, g, b, *sigma_t = sum(rows[1:], rows[0])
-        return Classified((r, g, b), tuple(sigma_t))
+        r, g, b, *rest = sum(rows[1:], rows[0])
+        columns = len(rest) - 3 * len(emission)
+        return Classified((r, g, b), tuple(rest[:columns]), tuple(rest[columns:]))
 
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
         # Whatever the length of the gradient: it depends on voxels farther away, too.
         n = self.rgb.shape[0]
-        visible = jnp.any(~(jnp.abs(self.sigma_t.reshape(n, -1)) <= least), axis=1)
+        visible = shown_entries([self.sigma_t] if self.emission is None else [self.sigma_t, self.emission], least)
         beyond = high < self.domain[0], low > self.domain[1]
         u, v = (_coordinate(s, self.domain, n) for s in (low, high))
         return any_between(visible, u, v, beyond if nearby else None)
 
 
 class GradientOpacity(AbstractTransfer):
-    """Another transfer function whose extinction is scaled by the length of the gradient: none at `low` and below, all of it from `high`
-    on, linear in between. It shows boundaries and hides what is homogeneous.
+    """Another transfer function whose extinction and own emission are scaled by the length of the gradient: none at `low` and below, all
+    of them from `high` on, linear in between. It shows boundaries and hides what is homogeneous.
 
     **Arguments:** `transfer`: of the scalar alone; `low`, `high`: lengths of the gradient in data units per world length. Differentiable.
     **Raises** `ValueError` unless `0 <= low < high`, `TypeError` for a transfer function that takes the gradient already.
@@ -84,9 +96,9 @@ class GradientOpacity(AbstractTransfer):
         # At `low` the derivative is that of less: where there is no gradient and `low` is 0, both can only grow.
         clipped = smaller(larger(self.low, magnitude), self.high)
         fraction = (clipped - self.low) / (self.high - self.low)
-        rgb, sigma_t = self.transfer.evaluate(s)
-        scaled: Channels = tuple(sigma * fraction for sigma in sigma_t)
-        return Classified(rgb, scaled)
+        rgb, sigma_t, emission = self.transfer.evaluate(s)
+        scaled: Callable[[Channels], Channels] = lambda channels: tuple(x * fraction for x in channels)
+        return Classified(rgb, scaled(sigma_t), scaled(emission))
 
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
         return self.transfer.is_visible(low, high, least, nearby=nearby)

@@ -181,7 +181,7 @@ def _checked(field: dataclasses.Field, value: Any, lengths: dict[str, int]) -> A
     if field.metadata.get("static"):
         return _chosen(field, value)
     classes = parts_of(field.type)
-    if classes and typing.get_origin(field.type) is tuple:
+    if classes and (typing.get_origin(field.type) is tuple or (isinstance(value, tuple | list) and takes_rows(field.type))):
         return _parts(field, value, classes, lengths)
     # A field may take an array in the place of a part.
     if classes and (isinstance(value, eqx.Module) or not takes_array(field.type)):
@@ -277,6 +277,11 @@ def parts_of(annotation: Any) -> tuple[type, ...]:
     is_row = typing.get_origin(annotation) is tuple
     kinds = alternatives(typing.get_args(annotation)[0] if is_row else annotation)
     return tuple(kind for kind in kinds if isinstance(kind, type) and issubclass(kind, eqx.Module))
+
+
+def takes_rows(annotation: Any) -> bool:
+    """Whether one of the types that an annotation names is a row of parts."""
+    return any(typing.get_origin(kind) is tuple for kind in alternatives(annotation))
 
 
 def shapes_of(field: dataclasses.Field) -> tuple[Shape, ...]:

@@ -16,10 +16,14 @@ exact, too. It has the same integral as `exp(-tau)`, nearly the same first momen
 of the table. One colour has no error; colours that are linear in `tau` have one of order `d^5`, and the curvature of the others adds
 the next term of Legendre's expansion of `exp(-tau)`, of order `d^5` also. With the segment in `parts` equal parts, the error falls as
 `parts^-4`, once a part is not opaque.
+
+Emission `q` of its own is seen through the same kernel, by its mean and by the mean of `q (tau - d / 2)`, both exact. Without extinction
+that is exact; else it has no error where `q` is proportional to the extinction, and one of order `d^2` and of how `q / sigma_t` bends along
+the segment elsewhere: what glows in front of something opaque wants steps, or parts, that are not opaque.
 """
 
 import itertools
-import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -27,9 +31,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jvr.model.optical import AbstractOpticalModel
+from jvr.model.optical import AbstractOpticalModel, with_own
+from jvr.model.stretches import Ramp, Stretch, means_of_blocks, own_ramp, ramp, union
 from jvr.model.transfer import AbstractTransfer, Classified, LinearTransfer, LutTransfer
-from jvr.numerics import divide_or_zero, one_minus_exp, read_run
+from jvr.numerics import attenuated, divide_or_zero, read_run
 from jvr.types import Channels, Scalar, Triple
 
 # How many intervals away from a table a scalar is clamped: beyond all precision, and its square does not overflow.
@@ -42,24 +47,33 @@ class SegmentMeans(NamedTuple):
     With both ends in one interval of the table or in neighbouring ones, `rgb` is the mean colour of the ends, and `surplus` and `lag`
     are small and vanish with the change of the colour: nearly equal ends, or one colour, are a segment of constant properties to the
     last digit, opaque or not. Else `rgb` is zero. `lag` is the mean of extinction times colour times `tau - d / 2`, the optical depth
-    from the middle of the segment, for a length of 1.
+    from the middle of the segment, for a length of 1. `own` and `own_lag`: the same means of emission of its own, where there is any.
     """
 
     rgb: Triple
     sigma_t: Channels
     surplus: Triple
     lag: Triple
+    own: Channels = ()
+    own_lag: Channels = ()
 
-    def emit(self, optical: AbstractOpticalModel, dt: Scalar) -> tuple[Channels, Channels]:
-        """Radiance that leaves the segment of length `dt` and its optical depth, in the channels of `optical.evaluate_segment`."""
+    def emit(self, optical: AbstractOpticalModel, dt: Scalar) -> tuple[Channels, Channels, Channels]:
+        """Radiance that leaves the segment of length `dt`, by its extinction and by its own emission, and its optical depth, in the
+        channels of `optical.evaluate_segment`."""
         emitted, dtau = optical.evaluate_segment(Classified(self.rgb, self.sigma_t), dt)
         if not emitted:
-            return emitted, dtau
+            return emitted, (), dtau
         if not dtau:
-            return tuple(e + more * dt for e, more in zip(emitted, self.surplus, strict=True)), dtau
+            coloured = tuple(e + more * dt for e, more in zip(emitted, self.surplus, strict=True))
+            return coloured, tuple(q * dt for q in self.own), dtau
         sigma_t = self.sigma_t * (3 // len(self.sigma_t))
-        rest = (more - lag * dt * _tilt(s * dt) for more, lag, s in zip(self.surplus, self.lag, sigma_t, strict=True))
-        return tuple(e + attenuated(j, s, dt) for e, j, s in zip(emitted, rest, sigma_t, strict=True)), dtau
+
+        def through(means: Channels, lags: Channels) -> Channels:
+            tilted = (j - lag * dt * _tilt(s * dt) for j, lag, s in zip(means, lags, sigma_t, strict=True))
+            return tuple(attenuated(j, s, dt) for j, s in zip(tilted, sigma_t, strict=True))
+
+        coloured = tuple(e + more for e, more in zip(emitted, through(self.surplus, self.lag), strict=True))
+        return coloured, through(self.own, self.own_lag) if self.own else (), dtau
 
 
 class PreIntegratedTable(AbstractTransfer):
@@ -68,7 +82,8 @@ class PreIntegratedTable(AbstractTransfer):
     **Arguments:** `table`: `LinearTransfer` or `LutTransfer`; `parts`: how many equal parts of a segment its self-attenuation takes
     apart, a rule of order 4. Extinction, and emission without attenuation, are exact whatever `parts`.
 
-    Memory: `n ceil(log2 n)` rows of 8 numbers, 10 for coloured extinction. Differentiable in every array of `table`.
+    Memory: `n ceil(log2 n)` rows of 8 numbers, 10 for coloured extinction, and 6 more for emission of its own. Differentiable in every
+    array of `table`.
     **Raises** `TypeError` for another transfer function, `ValueError` where `parts` is not a positive integer.
     """
 
@@ -86,10 +101,12 @@ class PreIntegratedTable(AbstractTransfer):
         n = table.rgb.shape[0]
         # An equally spaced table is measured in its own intervals: its entries sit at integers, exactly.
         x = table.positions if isinstance(table, LinearTransfer) else jnp.arange(n, dtype=table.rgb.dtype)
-        sigma_t = table.sigma_t.reshape(n, -1)
+        sigma_t, own = table.sigma_t.reshape(n, -1), [] if table.emission is None else [table.emission]
         # Both ends are repeated: outside of the table lies an interval of no width between equal entries.
-        self.entries = jnp.pad(jnp.concatenate([x[:, None], table.rgb, sigma_t], axis=1), ((1, 1), (0, 0)), mode="edge")
-        self.blocks = _blocks(x, table.rgb, sigma_t)
+        self.entries = jnp.pad(jnp.concatenate([x[:, None], table.rgb, sigma_t, *own], axis=1), ((1, 1), (0, 0)), mode="edge")
+        mean, rise = lambda v: 0.5 * (v[1:] + v[:-1]), lambda v: v[1:] - v[:-1]
+        of = lambda ramp, values: ramp(mean(sigma_t), rise(sigma_t), mean(values), rise(values))
+        self.blocks = means_of_blocks(x, (of(ramp, table.rgb), *(of(own_ramp, q) for q in own)))
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         return self.table.evaluate(s)
@@ -104,17 +121,25 @@ class PreIntegratedTable(AbstractTransfer):
         Differentiable in everything. Where an end lies at an entry the derivative in the scalar is that of one side. The place of an
         entry between those of a `LutTransfer`'s domain is known to rounding: so is which side a scalar nearer than that lies on.
         """
-        emitted, dtau = self.means(s0, s1).emit(optical, dt)
+        emitted, own, dtau = self.evaluate_apart(optical, s0, s1, dt)
+        return with_own(emitted, own), dtau
+
+    def evaluate_apart(
+        self, optical: AbstractOpticalModel, s0: Scalar, s1: Scalar, dt: Scalar
+    ) -> tuple[Channels, Channels, Channels]:
+        """The same with the radiance in two: that of the extinction's colour, and that of own emission, empty where there is none."""
+        emitted, own, dtau = self.means(s0, s1).emit(optical, dt)
         if self.parts == 1 or not emitted or not dtau:
-            return emitted, dtau
+            return emitted, own, dtau
         ends = [s0 + (s1 - s0) * (k / self.parts) for k in range(self.parts)] + [s1]
         parts = [self.means(a, b).emit(optical, dt / self.parts) for a, b in itertools.pairwise(ends)]
-        emitted, dtau = parts[0]
-        for more, depth in parts[1:]:
+        emitted, own, dtau = parts[0]
+        for more, own_too, depth in parts[1:]:
             T = tuple(jnp.exp(-tau) for tau in dtau) * (3 // len(dtau))
             emitted = tuple(e + t * m for e, t, m in zip(emitted, T, more, strict=True))
+            own = tuple(e + t * m for e, t, m in zip(own, T, own_too, strict=False))
             dtau = tuple(tau + d for tau, d in zip(dtau, depth, strict=True))
-        return emitted, dtau
+        return emitted, own, dtau
 
     def means(self, s0: Scalar, s1: Scalar) -> SegmentMeans:
         """The means over a segment along which the scalar goes linearly from `s0` at the front to `s1` at the back."""
@@ -123,15 +148,32 @@ class PreIntegratedTable(AbstractTransfer):
         a, b = self._locate(jnp.where(falls, s1, s0)), self._locate(jnp.where(falls, s0, s1))
         a, b, blocks = self._read(a, b)
         cut = _cut(a, b, blocks)
-        n_sigma = len(a.left) - 3
+        n_sigma = self.table.sigma_t.size // self.table.rgb.shape[0]
         channels = []
         for c in range(3):
             sigma, colour = (_profile(a, b, cut, column) for column in (3 + c % n_sigma, c))
-            whole = (_Stretch(m[1 + c % n_sigma], m[1 + n_sigma + c], m[4 + n_sigma + c]) for m in blocks)
-            pair = zip(_far_apart(cut, sigma, colour, *whole), _nearby(cut, sigma, colour), strict=True)
+            whole = (Stretch(m[1 + c % n_sigma], m[1 + n_sigma + c], m[4 + n_sigma + c]) for m in blocks)
+            pair = zip(_far_apart(cut, sigma, colour, ramp, *whole), _nearby(cut, sigma, colour), strict=True)
             channels.append([jnp.where(cut.whole, far, near) for far, near in pair])
         rgb, sigma_t, surplus, lag = (tuple(v) for v in zip(*channels, strict=True))
-        return SegmentMeans(rgb, sigma_t[:n_sigma], surplus, tuple(jnp.where(falls, -v, v) for v in lag))
+        turned: Callable[[Channels], Channels] = lambda lags: tuple(jnp.where(falls, -v, v) for v in lags)
+        found = SegmentMeans(rgb, sigma_t[:n_sigma], surplus, turned(lag))
+        if self.table.emission is None:
+            return found
+        own, own_lag = self._own_means(a, b, cut, blocks)
+        return found._replace(own=own, own_lag=turned(own_lag))
+
+    def _own_means(self, a: "_End", b: "_End", cut: "_Cut", blocks: tuple[Channels, Channels]) -> tuple[Channels, Channels]:
+        """Means of the emission of its own, and of that times the depth from the middle."""
+        n_sigma = self.table.sigma_t.size // self.table.rgb.shape[0]
+        channels = []
+        for c in range(3):
+            sigma, own = (_profile(a, b, cut, column) for column in (3 + c % n_sigma, 3 + n_sigma + c))
+            whole = (Stretch(m[1 + c % n_sigma], m[7 + n_sigma + c], m[10 + n_sigma + c]) for m in blocks)
+            _, _, *far = _far_apart(cut, sigma, own, own_ramp, *whole)
+            channels.append([jnp.where(cut.whole, *pair) for pair in zip(far, _own_nearby(cut, sigma, own), strict=True)])
+        own, lag = (tuple(v) for v in zip(*channels, strict=True))
+        return own, lag
 
     def _locate(self, s: Scalar) -> tuple[Scalar, Int[Array, ""]]:
         """A coordinate that is linear in the scalar, also outside of the table, and the interval, 0 and `n` outside of it."""
@@ -253,31 +295,6 @@ def _profile(a: _End, b: _End, cut: _Cut, column: int) -> _Profile:
     return _Profile(at_a + 0.5 * rise, rise, at_b - 0.5 * rise_too, rise_too, 0.5 * (at_a + at_b))
 
 
-class _Stretch(NamedTuple):
-    """Means over a stretch of the scalar in one channel: extinction, extinction times colour, and `lag` as in `SegmentMeans`."""
-
-    sigma: Float[Array, "..."]
-    emission: Float[Array, "..."]
-    lag: Float[Array, "..."]
-
-
-def _ramp(sigma: Array, sigma_rise: Array, colour: Array, colour_rise: Array) -> _Stretch:
-    """A stretch along which extinction and colour, of these means, change linearly by these amounts (its integrals in closed form)."""
-    lag = colour_rise * (jnp.square(sigma) * (1 / 12) - jnp.square(sigma_rise) * (1 / 240))
-    return _Stretch(sigma, sigma * colour + sigma_rise * colour_rise * (1 / 12), lag)
-
-
-def _union(fraction: Array, one: _Stretch, fraction_too: Array, other: _Stretch) -> _Stretch:
-    """One stretch and then another, averaged over a whole of which they are these fractions."""
-    sigma, sigma_too = fraction * one.sigma, fraction_too * other.sigma
-    emission, emission_too = fraction * one.emission, fraction_too * other.emission
-    # The middle of the union is farther back than that of the first by half of the other's depth, and the other way round.
-    apart = 0.5 * (emission_too * sigma - emission * sigma_too)
-    return _Stretch(
-        sigma + sigma_too, emission + emission_too, jnp.square(fraction) * one.lag + jnp.square(fraction_too) * other.lag + apart
-    )
-
-
 # Colour, extinction, surplus and lag of one channel.
 _Channel = tuple[Scalar, Scalar, Scalar, Scalar]
 
@@ -292,57 +309,31 @@ def _nearby(cut: _Cut, sigma: _Profile, colour: _Profile) -> _Channel:
     first = 1 - last
     bend, bend_too = sigma.rise * colour.rise * (1 / 12), sigma.rise_too * colour.rise_too * (1 / 12)
     surplus = first * (bend - 0.5 * colour.rise_too * sigma.first) + last * (bend_too + 0.5 * colour.rise * sigma.last)
-    lag = _ramp(sigma.first, sigma.rise, colour.first, colour.rise).lag
-    lag_too = _ramp(sigma.last, sigma.rise_too, colour.last, colour.rise_too).lag
+    lag = ramp(sigma.first, sigma.rise, colour.first, colour.rise).lag
+    lag_too = ramp(sigma.last, sigma.rise_too, colour.last, colour.rise_too).lag
     apart = 0.5 * sigma.first * sigma.last * (colour.rise + colour.rise_too) + sigma.first * bend_too - sigma.last * bend
     lag = jnp.square(first) * lag + jnp.square(last) * lag_too + 0.5 * first * last * apart
     return colour.ends, sigma.first + 0.5 * last * (sigma.rise + sigma.rise_too), surplus, lag
 
 
-def _far_apart(cut: _Cut, sigma: _Profile, colour: _Profile, block: _Stretch, block_too: _Stretch) -> _Channel:
+def _own_nearby(cut: _Cut, sigma: _Profile, own: _Profile) -> tuple[Scalar, Scalar]:
+    """The same of emission of its own: its mean, and its lag."""
+    last = cut.last
+    first = 1 - last
+    lag = own_ramp(sigma.first, sigma.rise, own.first, own.rise).lag
+    lag_too = own_ramp(sigma.last, sigma.rise_too, own.last, own.rise_too).lag
+    apart = 0.5 * (sigma.first * (own.rise + own.rise_too) - own.first * (sigma.rise + sigma.rise_too))
+    lag = jnp.square(first) * lag + jnp.square(last) * lag_too + 0.5 * first * last * apart
+    return own.first + 0.5 * last * (own.rise + own.rise_too), lag
+
+
+def _far_apart(cut: _Cut, sigma: _Profile, values: _Profile, ramp: Ramp, block: Stretch, block_too: Stretch) -> _Channel:
     """Whole intervals between the ends."""
     one = jnp.ones_like(cut.first)
-    lower = _union(cut.first, _ramp(sigma.first, sigma.rise, colour.first, colour.rise), cut.block, block)
-    last = _ramp(sigma.last, sigma.rise_too, colour.last, colour.rise_too)
-    whole = _union(one, lower, one, _union(cut.block_too, block_too, cut.last, last))
+    lower = union(cut.first, ramp(sigma.first, sigma.rise, values.first, values.rise), cut.block, block)
+    last = ramp(sigma.last, sigma.rise_too, values.last, values.rise_too)
+    whole = union(one, lower, one, union(cut.block_too, block_too, cut.last, last))
     return jnp.zeros_like(one), whole.sigma, whole.emission, whole.lag
-
-
-# A length and the means over it.
-_Block = tuple[Float[Array, "..."], _Stretch]
-
-
-def _blocks(x: Float[Array, "n"], rgb: Float[Array, "n 3"], sigma_t: Float[Array, "n channels"]) -> Float[Array, "blocks means"]:
-    """Lengths and means of blocks of intervals, rows `level n + i`.
-
-    Intervals, numbered by their lower entries, are joined in pairs, these in pairs again, and so on. On level `l` pairs of halves of
-    `2^l` intervals are joined: there row `i` is from entry `i` to the middle of its pair, or from the middle to entry `i`.
-    """
-    n = x.shape[0]
-    levels = (n - 1).bit_length()
-    rise = lambda v: v[1:] - v[:-1]
-    mean = lambda v: 0.5 * (v[1:] + v[:-1])
-    intervals = (rise(x)[:, None], _ramp(mean(sigma_t), rise(sigma_t), mean(rgb), rise(rgb)))
-    to_end: _Block = jax.tree.map(lambda v: jnp.pad(v, ((0, 2**levels - n + 1), (0, 0))), intervals)
-    i = jnp.arange(2**levels)
-
-    def join(halves: tuple[_Block, _Block], level: Int[Array, ""]) -> tuple[tuple[_Block, _Block], Float[Array, "rows means"]]:
-        # From entry `i` to the end of its half, and from the beginning of its half to entry `i`.
-        to_end, from_start = halves
-        is_second = ((i >> level) & 1)[:, None] == 1
-        choose = lambda second, first: jax.tree.map(lambda a, b: jnp.where(is_second, a, b), second, first)
-        other_half = jax.tree.map(lambda v: v[((i >> level) ^ 1) << level], to_end)
-        length, means = choose(from_start, to_end)
-        joined = choose(to_end, _joined(to_end, other_half)), choose(_joined(other_half, from_start), from_start)
-        return joined, jnp.concatenate([length, *means], axis=1)
-
-    _, rows = jax.lax.scan(join, (to_end, jax.tree.map(jnp.zeros_like, to_end)), jnp.arange(levels))
-    return rows[:, :n].reshape(levels * n, -1)
-
-
-def _joined(one: _Block, other: _Block) -> _Block:
-    length = one[0] + other[0]
-    return length, _union(divide_or_zero(one[0], length), one[1], divide_or_zero(other[0], length), other[1])
 
 
 def _tilt(depth: Scalar) -> Scalar:
@@ -351,36 +342,3 @@ def _tilt(depth: Scalar) -> Scalar:
     steep = depth > 2e4
     y = 0.5 * jnp.where(steep, 0.0, depth)
     return jnp.where(steep, 2 / jnp.where(steep, depth, 1.0), jax.lax.rsqrt(jnp.sqrt(1 + jnp.square(jnp.square(y)))))
-
-
-@jax.custom_jvp
-def attenuated(j: Scalar, sigma_t: Scalar, dt: Scalar) -> Scalar:
-    """What leaves a segment of constant emission and extinction, `j dt phi1(sigma_t dt)`, `phi1(d) = (1 - exp(-d)) / d`.
-
-    Its derivative in `dt`, `j exp(-sigma_t dt)`, keeps its digits for opaque segments, and that in `sigma_t` for thin ones.
-    """
-    return j * dt * _phi1(sigma_t * dt)
-
-
-@attenuated.defjvp
-def _attenuated_jvp(primals: tuple[Scalar, Scalar, Scalar], tangents: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar]:
-    (j, sigma_t, dt), (dj, dsigma, ddt) = primals, tangents
-    depth = sigma_t * dt
-    through = dt * _phi1(depth)
-    return j * through, through * dj + j * dt * (dt * _phi1_slope(depth)) * dsigma + j * jnp.exp(-depth) * ddt
-
-
-def _phi1(depth: Scalar) -> Scalar:
-    negligible = jnp.abs(depth) < jnp.finfo(depth.dtype).tiny
-    return jnp.where(negligible, 1.0, one_minus_exp(depth) / jnp.where(negligible, 1.0, depth))
-
-
-def _phi1_slope(depth: Scalar) -> Scalar:
-    """`(exp(-d) - phi1(d)) / d`; below 1, where that cancels, by its series, the sum of `(-1)^k k d^(k-1) / (k + 1)!`."""
-    thin = jnp.abs(depth) < 1
-    d = jnp.where(thin, depth, 0.0)
-    series = jnp.zeros_like(d)
-    for k in range(17, 0, -1):
-        series = series * d + (-1) ** k * k / math.factorial(k + 1)
-    thick = jnp.where(thin, 1.0, depth)
-    return jnp.where(thin, series, (jnp.exp(-thick) - _phi1(thick)) / thick)

@@ -134,6 +134,8 @@ UNIT_INTERVAL = Interval(0.0, 1.0)
 FRACTION = Interval(0.0, 1.0, "()")
 ASYMMETRY = Interval(-1.0, 1.0, "()")
 EXTINCTION = Interval(low=0.0, per_length=True)
+# Of a medium by itself: radiance per world length.
+EMISSION = Interval(low=0.0, per_length=True, light="radiance")
 DEGREES = Interval(0.0, 180.0)
 ANGLE_OF_VIEW = Interval(0.0, 180.0, "()")
 INCREASING = Increasing()

@@ -7,7 +7,7 @@ from typing import Any
 
 import equinox as eqx
 
-from jvr.model.clipping import ClippingBox
+from jvr.model.clipping import AbstractClipping, ClippingBox
 from jvr.model.effects import (
     AbstractMaterial,
     AbstractRadianceTransfer,
@@ -40,10 +40,11 @@ class Scene(AbstractPart):
     - `transfer`: a transfer function, `jvr.LinearTransfer`, `jvr.LutTransfer` or `jvr.GaussianTransfer`.
     - `background`: what shows through what is transparent: `(3,)` linear RGB, `jvr.EnvironmentMap`, or `None`.
     - `optical`: `jvr.EmissionAbsorption()` (default), `jvr.EmissionOnly()` or `jvr.AbsorptionOnly()`.
-    - `clipping`: `jvr.ClippingBox` or `None`.
+    - `clipping`: what is left of the volume: `jvr.ClippingBox`, `jvr.ClippingPlane`, several of them in a row, or `None`: all of it.
     - `lights`: any number of `jvr.DirectionalLight`, `jvr.PointLight`, `jvr.SpotLight`, `jvr.HeadLight`, `jvr.AmbientLight` and
       `jvr.EnvironmentLight`.
-    - `shading`: what surfaces make of light: `jvr.Lambert`, `jvr.Phong`, `jvr.BlinnPhong`, or `None`: the medium glows as it is.
+    - `shading`: what surfaces make of light: `jvr.Lambert`, `jvr.Phong`, `jvr.BlinnPhong`,
+      `jvr.PhenomenologicalBSDF`, or `None`: the medium glows as it is.
     - `shadows`: how much of each light reaches a point: `jvr.ShadowRays`, `jvr.ShadowVolume`, `jvr.ShadowMap`, `jvr.OpacityShadowMap`,
       `jvr.DeepShadowMap`, or `None`: all of it.
     - `scattering`: what the medium makes of light: `jvr.SingleScattering` or `None`.
@@ -65,7 +66,10 @@ class Scene(AbstractPart):
     transfer: AbstractTransfer = parameter(doc="one of jvr's")
     background: Vector | EnvironmentMap | None = parameter(COLOUR, doc="red, green, blue, linear, or a jvr.EnvironmentMap")
     optical: AbstractOpticalModel = parameter(doc="one of jvr's")
-    clipping: ClippingBox | None = parameter(doc="a jvr.ClippingBox")
+    # The first class is that of a file that names none.
+    clipping: ClippingBox | AbstractClipping | tuple[ClippingBox | AbstractClipping, ...] | None = parameter(
+        doc="a jvr.ClippingBox, a jvr.ClippingPlane or a sequence of them"
+    )
     lights: tuple[AbstractLight, ...] = parameter(doc="a sequence of jvr's lights")
     shading: AbstractShading | None = parameter(doc="one of jvr's")
     shadows: AbstractShadows | None = parameter(doc="one of jvr's")
@@ -84,7 +88,7 @@ class Scene(AbstractPart):
         *,
         background: ArrayLike | EnvironmentMap | None = None,
         optical: AbstractOpticalModel = EmissionAbsorption(),
-        clipping: ClippingBox | None = None,
+        clipping: AbstractClipping | Sequence[AbstractClipping] | None = None,
         lights: Sequence[AbstractLight] = (),
         shading: AbstractShading | None = None,
         shadows: AbstractShadows | None = None,
@@ -96,6 +100,8 @@ class Scene(AbstractPart):
         geometry: AbstractGeometry | None = None,
         surfaces: AbstractSurfaces | None = None,
     ):
+        # None of several is no clipping.
+        clipping = clipping if isinstance(clipping, AbstractClipping) or clipping else None
         assign(self, volume=volume, transfer=transfer, background=background, optical=optical, clipping=clipping)
         assign(self, lights=lights, shading=shading, shadows=shadows, scattering=scattering, normals=normals)
         assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer, geometry=geometry)

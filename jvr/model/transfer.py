@@ -1,7 +1,10 @@
 """Transfer functions: from the scalar `s` to colour and extinction."""
 
 import abc
-from typing import Any, ClassVar, NamedTuple
+import dataclasses
+import functools
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -9,23 +12,29 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jvr.model.parameters import assign, parameter
-from jvr.model.parts import AbstractPart, PlanEntry
-from jvr.model.ranges import COLOUR, EXTINCTION, INCREASING, POSITIVE
+from jvr.model.parts import AbstractPart, PlanEntry, is_zero
+from jvr.model.ranges import COLOUR, EMISSION, EXTINCTION, INCREASING, POSITIVE
 from jvr.numerics import clamp, divide_or_zero, read_run
 from jvr.types import ArrayLike, Channels, Scalar, Triple
 
 
 class Classified(NamedTuple):
-    """What a transfer function makes of a scalar: source colour (linear RGB) and extinction (1 / world length),
-    the latter one component for grey media and three for coloured ones."""
+    """What a transfer function makes of a scalar: source colour (linear RGB), extinction (1 / world length), one component for grey media
+    and three for coloured ones, and emission of its own (radiance / world length), three components or none."""
 
     rgb: Triple
     sigma_t: Channels
+    emission: Channels = ()
 
 
 def extinction(*, ordered: bool) -> Any:
     """The declaration of an extinction for each entry, grey or coloured."""
     return parameter(EXTINCTION, shapes=(("n",), ("n", 3)), ordered=ordered, doc="extinction", unit="1 / mm")
+
+
+def own_emission(*, ordered: bool) -> Any:
+    """The declaration of an emission for each entry."""
+    return parameter(EMISSION, ordered=ordered, doc="emission of its own: red, green, blue", unit="radiance / mm")
 
 
 class AbstractTransfer(AbstractPart):
@@ -40,8 +49,25 @@ class AbstractTransfer(AbstractPart):
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         arguments = (scene.volume.slope,) * (2 if self.takes_gradient else 1)
-        coloured = len(jax.eval_shape(self.evaluate, *arguments).sigma_t) == 3
-        return (PlanEntry(name, True, f"{type(self).__name__}, {'coloured' if coloured else 'grey'} extinction"),)
+        found = jax.eval_shape(self.evaluate, *arguments)
+        words = f"{type(self).__name__}, {'coloured' if len(found.sigma_t) == 3 else 'grey'} extinction"
+        return (PlanEntry(name, True, f"{words}, emission of its own" if found.emission else words),)
+
+    def title(self, name: str, scene: Any) -> str:
+        return "emission of its own"
+
+    def without(self, scene: Any) -> Any:
+        # A medium cannot do without extinction, but without what it emits beside.
+        if getattr(self, "emission", None) is None:
+            return None
+        return dataclasses.replace(scene, transfer=dataclasses.replace(cast(Any, self), emission=None))
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        emission = getattr(self, "emission", None)
+        if emission is not None and is_zero(emission):
+            yield f"{name}.emission is zero everywhere: leave it out"
+        if emission is not None and not scene.optical.emits:
+            yield f"{name}.emission does not show: nothing glows under {type(scene.optical).__name__}"
 
     @abc.abstractmethod
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
@@ -49,10 +75,10 @@ class AbstractTransfer(AbstractPart):
 
     @abc.abstractmethod
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
-        """Whether any value from `low` to `high` may have extinction above `least`; never falsely `False`.
+        """Whether any value from `low` to `high` may have extinction or emission of its own above `least`; never falsely `False`.
 
-        With `nearby`, whether any may however little it is changed: where none is, extinction has no derivative in the value nor in
-        where entries lie.
+        With `nearby`, whether any may however little it is changed: where none is, neither has a derivative in the value nor in where
+        entries lie.
         """
 
     def _repr_html_(self) -> str:
@@ -62,8 +88,13 @@ class AbstractTransfer(AbstractPart):
         return transfer_html(self)
 
 
+# Fields of a table whose entries are what it interpolates between.
+ENTRIES = ("rgb", "sigma_t", "emission")
+
+
 class AbstractTable(AbstractTransfer):
-    """A transfer function that interpolates the rows of a table linearly, colour and extinction separately."""
+    """A transfer function that interpolates the rows of a table linearly, colour, extinction and (in a field `emission`, where it has one)
+    emission separately."""
 
     rgb: eqx.AbstractVar[Float[Array, "n 3"]]
     sigma_t: eqx.AbstractVar[Float[Array, "..."]]
@@ -77,8 +108,15 @@ class AbstractTable(AbstractTransfer):
     def coordinate(self, s: Scalar) -> Scalar:
         """Where `s` falls in the table, 0 ... n-1, clamped; entry `i` has weight `max(0, 1 - |coordinate - i|)`."""
 
+    @property
+    def entries(self) -> dict[str, Float[Array, "n *channels"]]:
+        """Its columns by their field's name, those that it has."""
+        found = {name: getattr(self, name, None) for name in ENTRIES}
+        return {name: column for name, column in found.items() if column is not None}
+
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
-        visible = jnp.any(~(jnp.abs(self.sigma_t.reshape(self.sigma_t.shape[0], -1)) <= least), axis=1)
+        columns = [column for name, column in self.entries.items() if name != "rgb"]
+        visible = shown_entries(columns, least)
         beyond = high < self.ends[0], low > self.ends[1]
         return any_between(visible, self.coordinate(low), self.coordinate(high), beyond if nearby else None)
 
@@ -87,16 +125,18 @@ class LinearTransfer(AbstractTable):
     """A piecewise linear transfer function: linear between control points, constant beyond the first and the last.
 
     **Arguments:** `positions`: `(n,)`, strictly increasing, in the data's units; `rgb`: `(n, 3)`, linear; `sigma_t`: `(n,)`, or
-    `(n, 3)` for coloured extinction, per world length, not negative. All differentiable, positions too.
+    `(n, 3)` for coloured extinction, per world length, not negative; `emission`: `(n, 3)`, radiance per world length, what the medium
+    emits by itself beside `sigma_t rgb`, also where it absorbs nothing, or `None`. All differentiable, positions too.
     **Raises** `ValueError` for other shapes, positions that do not increase, negative or non-finite values.
     """
 
     positions: Float[Array, "n"] = parameter(INCREASING, least=2, doc="in the data's own units")
     rgb: Float[Array, "n 3"] = parameter(COLOUR, ordered=True, doc="red, green, blue, linear")
     sigma_t: Float[Array, "..."] = extinction(ordered=True)
+    emission: Float[Array, "n 3"] | None = own_emission(ordered=True)
 
-    def __init__(self, positions: ArrayLike, rgb: ArrayLike, sigma_t: ArrayLike):
-        assign(self, positions=positions, rgb=rgb, sigma_t=sigma_t)
+    def __init__(self, positions: ArrayLike, rgb: ArrayLike, sigma_t: ArrayLike, emission: ArrayLike | None = None):
+        assign(self, positions=positions, rgb=rgb, sigma_t=sigma_t, emission=emission)
 
     @property
     def ends(self) -> tuple[Scalar, Scalar]:
@@ -118,16 +158,17 @@ class LinearTransfer(AbstractTable):
 class LutTransfer(AbstractTable):
     """A lookup table with equally spaced entries: entries 0 and n-1 sit at the ends of `domain`, values clamp outside of it.
 
-    **Arguments:** `rgb`: `(n, 3)`; `sigma_t`: `(n,)` or `(n, 3)`; `domain`: `(low, high)` in the data's units. All
-    differentiable. **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
+    **Arguments:** `rgb`: `(n, 3)`; `sigma_t`: `(n,)` or `(n, 3)`; `domain`: `(low, high)` in the data's units; `emission`: `(n, 3)` or
+    `None`, as of `LinearTransfer`. All differentiable. **Raises** `ValueError` as `LinearTransfer`, and where `low >= high`.
     """
 
     rgb: Float[Array, "n 3"] = parameter(COLOUR, ordered=True, least=2, doc="red, green, blue, linear")
     sigma_t: Float[Array, "..."] = extinction(ordered=True)
     domain: Float[Array, "2"] = parameter(INCREASING, doc="low < high in the data's own units")
+    emission: Float[Array, "n 3"] | None = own_emission(ordered=True)
 
-    def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike):
-        assign(self, rgb=rgb, sigma_t=sigma_t, domain=domain)
+    def __init__(self, rgb: ArrayLike, sigma_t: ArrayLike, domain: ArrayLike, emission: ArrayLike | None = None):
+        assign(self, rgb=rgb, sigma_t=sigma_t, domain=domain, emission=emission)
 
     @property
     def positions(self) -> Float[Array, "n"]:
@@ -154,23 +195,27 @@ class GaussianTransfer(AbstractTransfer):
     the mean colour instead of its Gaussian's own.
 
     **Arguments:** `center`, `width`: `(n,)` in the data's units, widths positive; `height`: `(n,)` or `(n, 3)`, per world length;
-    `rgb`: `(n, 3)`. All differentiable. **Raises** `ValueError` for other shapes, widths not positive, negative heights.
+    `rgb`: `(n, 3)`; `emission`: `(n, 3)`, radiance per world length that each Gaussian emits by itself at its centre, summed as the
+    extinctions are, or `None`. All differentiable.
+    **Raises** `ValueError` for other shapes, widths not positive, negative heights.
     """
 
     center: Float[Array, "n"] = parameter(doc="in the data's own units")
     width: Float[Array, "n"] = parameter(POSITIVE, doc="in the data's own units")
     height: Float[Array, "..."] = extinction(ordered=False)
     rgb: Float[Array, "n 3"] = parameter(COLOUR, doc="red, green, blue, linear")
+    emission: Float[Array, "n 3"] | None = own_emission(ordered=False)
 
-    def __init__(self, center: ArrayLike, width: ArrayLike, height: ArrayLike, rgb: ArrayLike):
-        assign(self, center=center, width=width, height=height, rgb=rgb)
+    def __init__(self, center: ArrayLike, width: ArrayLike, height: ArrayLike, rgb: ArrayLike, emission: ArrayLike | None = None):
+        assign(self, center=center, width=width, height=height, rgb=rgb, emission=emission)
 
     def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
         limit = jnp.finfo(self.center.dtype).max
         # Squared below: farther out the square would overflow, and the colour of two overflows is undefined.
         z = jnp.clip((s - self.center) / self.width, -0.5 * limit**0.5, 0.5 * limit**0.5)
         exponent = -0.5 * jnp.square(z)
-        sigma_t = tuple(jnp.sum(channel * jnp.exp(exponent)) for channel in _columns(self.height))
+        summed = lambda heights: tuple(jnp.sum(channel * jnp.exp(exponent)) for channel in _columns(heights))
+        sigma_t, emission = summed(self.height), () if self.emission is None else summed(self.emission)
         # A softmax of log(height) + exponent, but linear in the height: the logarithm's derivative at zero is infinite.
         height = self.height if self.height.ndim == 1 else jnp.mean(self.height, axis=1)
         height = jnp.where(jnp.any(height > 0), height, 1.0)
@@ -178,14 +223,22 @@ class GaussianTransfer(AbstractTransfer):
         largest = jax.lax.stop_gradient(jnp.max(exponent + log_height, where=height > 0, initial=-limit))
         weight = height * jnp.exp(jnp.minimum(exponent - largest, 0.9 * jnp.log(limit)))
         weight = divide_or_zero(weight, jnp.broadcast_to(jnp.sum(weight), weight.shape))
-        return Classified(_three(self.rgb.T @ weight), sigma_t)
+        return Classified(_three(self.rgb.T @ weight), sigma_t, emission)
 
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
         # The largest extinction of each Gaussian in the range: at its centre, or at the end nearer to it. Zero is where it underflows,
         # and so does its derivative.
         nearest = jnp.clip(self.center, low, high)
         height = self.height if self.height.ndim == 1 else jnp.max(self.height, axis=1)
-        return ~(jnp.sum(jnp.abs(height) * jnp.exp(-0.5 * jnp.square((nearest - self.center) / self.width))) <= least)
+        largest = lambda height: jnp.sum(jnp.abs(height) * jnp.exp(-0.5 * jnp.square((nearest - self.center) / self.width)))
+        visible = ~(largest(height) <= least)
+        return visible if self.emission is None else visible | ~(largest(jnp.max(self.emission, axis=1)) <= least)
+
+
+def shown_entries(columns: Sequence[Float[Array, "n ..."]], least: Scalar | float) -> Bool[Array, "n"]:
+    """Which entries, along the first axis, have anything above `least` in any of some columns."""
+    flat = (column.reshape(column.shape[0], -1) for column in columns)
+    return functools.reduce(jnp.logical_or, [jnp.any(~(jnp.abs(column) <= least), axis=1) for column in flat])
 
 
 def any_between(
@@ -216,11 +269,13 @@ def _three(v: Float[Array, "3"]) -> Triple:
 
 def _interpolate(table: AbstractTable, u: Scalar) -> Classified:
     # Each row beside the next, so that one read brings both around `u` with all their columns.
-    rows = jnp.stack([*_columns(table.rgb), *_columns(table.sigma_t)], axis=1)
+    names = table.entries
+    rows = jnp.stack([column for entries in names.values() for column in _columns(entries)], axis=1)
     pairs, columns = jnp.concatenate([rows[:-1], rows[1:]], axis=1), rows.shape[1]
     low = jnp.clip(jnp.floor(u), 0, rows.shape[0] - 2)
     fraction = u - low
     pair = read_run(pairs, low.astype(jnp.int32), 1)[0]
     # The weighted sum, not a + f (b - a): at an end of an interval it returns the entry exactly.
-    r, g, b, *sigma_t = ((1 - fraction) * pair[c] + fraction * pair[columns + c] for c in range(columns))
-    return Classified((r, g, b), tuple(sigma_t))
+    r, g, b, *rest = ((1 - fraction) * pair[c] + fraction * pair[columns + c] for c in range(columns))
+    sigma_columns = len(rest) - 3 * ("emission" in names)
+    return Classified((r, g, b), tuple(rest[:sigma_columns]), tuple(rest[sigma_columns:]))

@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -15,13 +17,13 @@ from jvr.execution.devices import once, spread
 from jvr.model.bricks import Bricks, bricks_of
 from jvr.model.checks import affine, require
 from jvr.model.exact import Exact, Remainder
-from jvr.model.interpolation import AbstractInterpolation, Trilinear
+from jvr.model.interpolation import AbstractInterpolation, Tricubic, Trilinear, spline_coefficients
 from jvr.model.kept import is_made_of, made_by, note_sources
 from jvr.model.packing import Squares, squares_of
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import AbstractPart, PlanEntry
 from jvr.model.voxels import VOXEL, as_missing, in_memory, masked_voxels, typical_range, without_gaps
-from jvr.numerics import add_runs, read_at, read_run, transformed, turned
+from jvr.numerics import add_runs, inverse_of_axes, read_at, read_run, transformed, turned
 from jvr.types import Affine, ArrayLike, Scalar, Triple, Vector, Voxels
 
 
@@ -38,7 +40,7 @@ class Volume(AbstractPart):
       holds, too: any byte order, truth values, integers of 64 bits as narrow as they fit.
     - `world_from_grid`: 4x4 affine, default the identity.
     - `slope`, `intercept`: scalars, default 1 and 0, as DICOM's rescale.
-    - `interpolation`: `Trilinear()` (default) or `Nearest()`.
+    - `interpolation`: `Trilinear()` (default), `Tricubic()` or `Nearest()`.
     - `missing`: the stored number that means "no data", such as -2000; NaN voxels mean that by themselves, and so do, with
       a warning, those beyond 1e30. A sample that is made of such a
       voxel is empty, and neither the range of values nor gradients know of it: `values` holds what lies around in its place.
@@ -51,7 +53,8 @@ class Volume(AbstractPart):
     A masked array of NumPy has its masked voxels missing.
     `dataclasses.replace(volume, slope=2.0)` makes a volume that differs in that, as `equinox.tree_at` does.
 
-    `bricks`, `squares` and `gradients` are `None` until `bricked()`, `packed()` and `graded()` make them. What has been replaced since is
+    `bricks`, `squares`, `gradients` and `sobel_gradients` are `None` until `bricked()`, `packed()`, `graded()` and `graded_by_sobel()` make
+    them. What has been replaced since is
     never seen in their place: `current()` makes them anew where they are not known to belong to the voxels. `gaps` says which voxels are
     missing (bit 0; bit 1: which cells of eight have one that is), `None` where none is; voxels that are replaced keep it.
 
@@ -68,6 +71,7 @@ class Volume(AbstractPart):
     bricks: Bricks | None = eqx.field(init=False, metadata=made_by("bricked"))
     squares: Squares | None = eqx.field(init=False, metadata=made_by("packed"))
     gradients: Float[Array, "x y z 3"] | None = eqx.field(init=False, metadata=made_by("graded"))
+    sobel_gradients: Float[Array, "x y z 3"] | None = eqx.field(init=False, metadata=made_by("graded_by_sobel"))
     gaps: UInt8[Array, "x y z"] | None = parameter(doc="which voxels are missing")
     remainder: Remainder = parameter(doc="what single precision leaves of world_from_grid")
     unit: str = choice(doc="of the data, such as HU")
@@ -115,6 +119,7 @@ class Volume(AbstractPart):
         self.bricks = None
         self.squares = None
         self.gradients = None
+        self.sobel_gradients = None
 
     def bricked(self, size: int = 4) -> "Volume":
         """The same volume with the bounds of its bricks of `size^3` voxels, which empty-space skipping needs; without them each
@@ -143,15 +148,35 @@ class Volume(AbstractPart):
         note_sources(squares.entries, volume.values)
         return eqx.tree_at(lambda v: v.squares, volume, squares, is_leaf=lambda x: x is None).current()
 
+    def prefiltered(self) -> "Volume":
+        """The volume whose tricubic B-spline goes through the voxels: its voxels are the spline's coefficients, in floating point and
+        differentiable in those. They may exceed the range of the voxels, and so may values between these.
+
+        Only for `Tricubic()`: other interpolation would show the coefficients. **Raises** `ValueError` for that, and where voxels are
+        missing.
+        """
+        if not isinstance(self.interpolation, Tricubic):
+            raise ValueError("coefficients are those of a tricubic spline: set Volume(interpolation=jvr.Tricubic())")
+        if self.gaps is not None:
+            raise ValueError("voxels are missing, and a spline goes through all: fill them in, or leave prefiltered() out")
+        return dataclasses.replace(self, values=spline_coefficients(self.values.astype(self.slope.dtype)))
+
     def graded(self) -> "Volume":
         """The same volume with the gradients at its voxels, which `jvr.PrecomputedGradient()` interpolates; without them each picture
         computes them anew, as it does where voxels, slope or intercept are differentiated or arguments of `jit` (`current`). They take
         12 bytes a voxel."""
+        return self._graded(lambda v: v.gradients, sobel=False)
+
+    def graded_by_sobel(self) -> "Volume":
+        """The same with gradients that are smoothed as Sobel's differences are, for `jvr.PrecomputedGradient(sobel=True)`."""
+        return self._graded(lambda v: v.sobel_gradients, sobel=True)
+
+    def _graded(self, place: Any, *, sobel: bool) -> "Volume":
         volume = self._spread()
         arrays = volume.values, volume.slope, volume.intercept
-        gradients = once(_gradients, *arrays)
+        gradients = once(partial(_gradients, sobel=sobel), *arrays)
         note_sources(gradients, *arrays)
-        return eqx.tree_at(lambda v: v.gradients, volume, gradients, is_leaf=lambda x: x is None)
+        return eqx.tree_at(place, volume, gradients, is_leaf=lambda x: x is None)
 
     def _spread(self) -> "Volume":
         """The same volume with its voxels on all devices, also those that took the place of others (`equinox.tree_at`)."""
@@ -176,8 +201,11 @@ class Volume(AbstractPart):
         volume = self
         if self.bricks is not None and not is_made_of(self.bricks.lower, self.values):
             volume = volume.bricked(self.bricks.size)
-        if self.gradients is not None and not is_made_of(self.gradients, self.values, self.slope, self.intercept):
+        of = self.values, self.slope, self.intercept
+        if self.gradients is not None and not is_made_of(self.gradients, *of):
             volume = volume.graded()
+        if self.sobel_gradients is not None and not is_made_of(self.sobel_gradients, *of):
+            volume = volume.graded_by_sobel()
         if self.squares is None or is_made_of(self.squares.entries, self.values):
             return volume
         fits = self.values.dtype == jnp.uint8 and self.values.shape == self.squares.entries.shape
@@ -263,15 +291,16 @@ class Volume(AbstractPart):
     def is_known(self, p: Triple) -> Bool[Array, ""]:
         """Whether no voxel that makes the value at one grid position is missing; a volume without gaps has no use for it."""
         assert self.gaps is not None
-        (start, _), *_ = self.interpolation.stencil(self.shape, p)
-        return read_at(self.gaps.reshape(-1), start) & self.interpolation.gap == 0
+        gaps, runs = self.gaps.reshape(-1), self.interpolation.stencil(self.shape, p)
+        is_missing = lambda index: read_at(gaps, index) & self.interpolation.gap != 0
+        if not self.interpolation.reach:
+            # Of a cell its first voxel says what all of them are.
+            return ~is_missing(runs[0].start)
+        each = [is_missing(run.start + i) & (w != 0) for run in runs for i, w in enumerate(run.weights)]
+        return ~functools.reduce(jnp.logical_or, each)
 
     def grid_from_world(self, x: Triple, *, direction: bool = False) -> Triple:
-        """Grid position of a world position, or with `direction=True` grid displacement of a world displacement.
-
-        Rows of the inverse are cross products of the axes, each scaled to unit length first: a spacing ratio of 1 : 1000 or
-        a world in kilometres costs no digits, as a general float32 inverse would.
-        """
+        """Grid position of a world position, or with `direction=True` grid displacement of a world displacement."""
         if not direction:
             x = tuple(x[i] - self.world_from_grid[i, 3] for i in range(3))
         return turned(self.axes_inverse, x)
@@ -283,10 +312,7 @@ class Volume(AbstractPart):
     @property
     def axes_inverse(self) -> Float[Array, "3 3"]:
         """Inverse of the linear part of `world_from_grid`; its transpose takes derivatives along the grid's axes to the world."""
-        lengths = self.spacing
-        a, b, c = (self.world_from_grid[:3, :3] / lengths).T
-        rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
-        return rows / (jnp.dot(a, rows[0]) * lengths[:, None])
+        return inverse_of_axes(self.world_from_grid[:3, :3])
 
     def deposit(self, total: "Volume", p: Triple, of_value: Float[Array, "points"], of_gradient: Triple = ()) -> "Volume":
         """Adds the derivative of `sum(of_value * s + of_gradient . grad s)` over a batch of grid positions to `total`, in place where
@@ -315,19 +341,35 @@ class Volume(AbstractPart):
         return total
 
 
-def gradients_at_voxels(values: Float[Array, "x y z"]) -> Float[Array, "x y z 3"]:
-    """Central differences along the grid's axes, one-sided at the border; zero along an axis of one voxel."""
+def gradients_at_voxels(values: Float[Array, "x y z"], *, sobel: bool = False) -> Float[Array, "x y z 3"]:
+    """Central differences along the grid's axes, one-sided at the border; zero along an axis of one voxel. With `sobel` each is averaged
+    along both other axes with weights 1, 2, 1."""
     along = [jnp.gradient(values, axis=a) if n > 1 else jnp.zeros_like(values) for a, n in enumerate(values.shape)]
+    if sobel:
+        others = [[other for other in range(3) if other != a] for a in range(3)]
+        along = [smoothed(jnp.asarray(g), (1, 2, 1), axes) for g, axes in zip(along, others, strict=True)]
     return jnp.stack([jnp.asarray(g) for g in along], axis=-1)
+
+
+def smoothed(values: Float[Array, "x y z"], weights: Sequence[int], axes: Sequence[int] = (0, 1, 2)) -> Float[Array, "x y z"]:
+    """Averages along some axes with an odd number of weights; the border is repeated."""
+    reach, total = len(weights) // 2, sum(weights)
+    for axis in axes:
+        n = values.shape[axis]
+        if n > 1:
+            padded = jnp.pad(values, [(reach, reach) if a == axis else (0, 0) for a in range(3)], mode="edge")
+            parts = (w / total * jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k, w in enumerate(weights))
+            values = sum(parts, jnp.zeros_like(values))
+    return values
 
 
 _bricks = jax.jit(bricks_of, static_argnums=1)
 _squares = jax.jit(squares_of)
 
 
-@jax.jit
-def _gradients(values: Voxels, slope: Scalar, intercept: Scalar) -> Float[Array, "x y z 3"]:
-    return gradients_at_voxels(values.astype(slope.dtype) * slope + intercept)
+@partial(jax.jit, static_argnames="sobel")
+def _gradients(values: Voxels, slope: Scalar, intercept: Scalar, *, sobel: bool) -> Float[Array, "x y z 3"]:
+    return gradients_at_voxels(values.astype(slope.dtype) * slope + intercept, sobel=sobel)
 
 
 @jax.jit
@@ -349,5 +391,5 @@ def _quantised(volume: Volume) -> Volume:
     slope, intercept = volume.slope * scale, volume.slope * low + volume.intercept
     # A level that happens to be the number of missing voxels is none of them.
     quantised = dataclasses.replace(volume, values=levels, slope=slope, intercept=intercept, missing=None)
-    kept = lambda v: (v.bricks, v.gradients)
+    kept = lambda v: (v.bricks, v.gradients, v.sobel_gradients)
     return eqx.tree_at(kept, quantised, kept(volume), is_leaf=lambda x: x is None)

@@ -18,7 +18,7 @@ from jvr.march.medium import DENSEST, AbstractVisibility, Medium, Visibilities
 from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.quadrature import PreIntegrated
 from jvr.march.shaders import GradientFrame, LightPathShader, OpticalShader, PreIntegratedShader
-from jvr.model.bricks import Bricks, bricks_of
+from jvr.model.bricks import Bricks, bricks_of, widened
 from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbsorptionOnly
 from jvr.model.parts import parts_of
@@ -135,13 +135,13 @@ def occupancy(scene: Scene, settings: "Settings") -> Occupancy | None:
 
 
 def bricks(volume: Volume) -> Bricks:
-    """Bounds of the bricks of a volume: those that it keeps, or made anew."""
+    """Bounds of what interpolation may return in the bricks of a volume: of those that it keeps, or made anew."""
     found = volume.bricks
     if found is None and isinstance(volume.values, Tracer):
-        return bricks_of(jax.lax.stop_gradient(volume.values))
-    if found is None:
+        found = bricks_of(jax.lax.stop_gradient(volume.values))
+    elif found is None:
         # Voxels that a traced function closes over are constants; the compiler would fold all of this, and takes seconds for it.
         with jax.ensure_compile_time_eval():
             found = volume.bricked().bricks
     assert found is not None
-    return found
+    return widened(found) if volume.interpolation.reach else found

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from jvr.march.march import Marched
 from jvr.march.steps import End, Rays
 from jvr.model.camera import AbstractCamera, Limits
-from jvr.model.clipping import Line, interval_inside
+from jvr.model.clipping import Line, interval_inside, moved_clipping
 from jvr.model.environment_map import EnvironmentMap
 from jvr.model.geometry import AbstractGeometry
 from jvr.model.scene import Scene
@@ -42,9 +42,8 @@ def near_volume(scene: Scene, *others: Any) -> Any:
     origin = jax.lax.stop_gradient(scene.volume.origin)
     placed = lambda s: (s.volume, s.clipping, s.lights, s.geometry)
     lights = tuple(light.moved(origin) for light in scene.lights)
-    clipping = None if scene.clipping is None else scene.clipping.moved(origin)
     geometry = None if scene.geometry is None else scene.geometry.moved(origin)
-    parts = (scene.volume.moved(origin), clipping, lights, geometry)
+    parts = (scene.volume.moved(origin), moved_clipping(scene.clipping, origin), lights, geometry)
     scene = eqx.tree_at(placed, scene, parts, is_leaf=lambda x: x is None)
     return scene, *(camera.moved(origin) for camera in cameras)
 
@@ -70,7 +69,7 @@ def enter(
     pixels: Int[Array, "rays"] | None = None,
     limits: Limits = (None, None),
 ) -> tuple[Rays, Float[Array, "rays"]]:
-    """World rays inside the volume (and its clipping box), and the distance from the eye, which is `behind` their origin by so much, to
+    """World rays inside the volume (and its clipping), and the distance from the eye, which is `behind` their origin by so much, to
     where they enter.
 
     They end at opaque geometry, and where what is behind differs from ray to ray, they know what they see there. `pixels`: of each, `None`

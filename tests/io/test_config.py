@@ -89,7 +89,17 @@ def refusal(text, *sets):
         ("[settings.sampling]\nkind = 'slices'\ntolerance = 0", "settings.sampling.tolerance", "must be positive"),
         ("[settings.sampling]\nkind = 'slices'\noracle = 'finst'", "settings.sampling.oracle", "did you mean 'finest'?"),
         ("[settings.sampling]\nkind = 'refinement'\ntile = 6", "settings.sampling", "a power of two from 2 to 64"),
-        ("[clipping]\nkind = 'box'\nlower = [0, 0, 0]\nupper = [1, 1, 1]", "clipping.kind", "unknown key"),
+        ("[clipping]\nkind = 'ball'\nlower = [0, 0, 0]\nupper = [1, 1, 1]", "clipping.kind", "known: box, plane"),
+        (
+            "[clipping]\nkind = 'plane'\npoint = [0, 0, 0]\nnormal = [0, 0, 0]",
+            "clipping.normal",
+            "must have a direction",
+        ),
+        (
+            "[[clipping]]\nlower = [0, 0, 0]\nupper = [1, 1, 1]\n[[clipping]]\nnormal = [0, 0, 1]",
+            "clipping[1].normal",
+            'kind = "plane"',
+        ),
         ("[camera]\nwidth = 12.5", "camera.width", "whole number"),
         ("[clipping]\nlower = [0, 0, 0]\nupper = [1, 1, 0]", "clipping", "lower < upper"),
         ("[fit]\nloss = 'huber'", "fit.images", "[truth]"),

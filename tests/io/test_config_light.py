@@ -96,6 +96,11 @@ TABLE = "{positions=[0.1,0.9],values=[0.2,0.4]}"
         ),
         ("shading", f"{{kind='phong',diffuse={TABLE},shininess=1}}", jvr.Phong(diffuse=BY_VALUE, shininess=1)),
         ("shading", f"{{kind='blinn-phong',specular={TABLE}}}", jvr.BlinnPhong(specular=BY_VALUE)),
+        (
+            "shading",
+            f"{{kind='phenomenological',k_d={TABLE},index=1.3,normalised=false}}",
+            jvr.PhenomenologicalBSDF(BY_VALUE, index=1.3, normalised=False),
+        ),
         ("shadows", "'rays'", jvr.ShadowRays()),
         ("shadows", "{kind='rays',step=2,termination=0}", jvr.ShadowRays(2, termination=0)),
         ("shadows", "{kind='volume',resolution=0.5}", jvr.ShadowVolume(0.5)),

@@ -308,7 +308,7 @@ def test_gaussians_are_sampled(tmp_path):
     interop.write_paraview(tmp_path / "a.json", interop.Preset(transfer))
     found = interop.read_paraview(tmp_path / "a.json").transfer
     x = np.linspace(-1, 4, 500)
-    rgb, (sigma,) = jax.vmap(transfer.evaluate)(x)
+    rgb, (sigma,), _ = jax.vmap(transfer.evaluate)(x)
     rgb, (again, also) = np.stack(rgb, -1), evaluated(found, x)
     np.testing.assert_allclose(1 - np.exp(-also), 1 - np.exp(-sigma), atol=2 * ERROR)
     np.testing.assert_allclose(again, rgb, atol=2 * ERROR)

@@ -64,6 +64,10 @@ def lights() -> jvr.Scene:
     return lit(lights=every, shading=shading, shadows=jvr.ShadowRays(2, termination=0.01))
 
 
+def shells() -> jvr.Scene:
+    return lit(shading=jvr.PhenomenologicalBSDF(0.4, by_value(0.1, 0.2), 0.3, 12.0, 7.0, 1.3, normalised=False, threshold=0.2))
+
+
 def phases() -> jvr.Scene:
     every = [jvr.Isotropic(), jvr.Rayleigh(), jvr.HenyeyGreenstein((0.1, 0.2, -0.3)), jvr.Schlick(0.4), jvr.JendersieEon(12.0)]
     every += [
@@ -135,9 +139,19 @@ SCENES = {
         jvr.Volume(with_gaps(), affine((0.1, 0.1, 0.2), (448262.133, 5411932.678, 112.341), (0.1, 0.2, 0.3))),
         clipping=jvr.ClippingBox((448262.4, 5411932.9, -np.inf), (448262.9, 5411933.7, np.inf)),
     ),
+    "cut open": lambda: scene(
+        jvr.Volume(with_gaps(), interpolation=jvr.Tricubic()).graded_by_sobel(),
+        jvr.LutTransfer(np.eye(3), [0.0, 1, 2], [0.0, 1.0], 0.1 * np.eye(3)),
+        clipping=(
+            jvr.ClippingPlane((448262.4, 0.5, 1), (1, -2, 0.5)),
+            jvr.ClippingBox((-1, -1, -1), (1, 2, 3), world_from_box=OBLIQUE),
+        ),
+        normals=jvr.PrecomputedGradient(sobel=True),
+    ),
     "replaced": replaced,
     "traced": lambda: jax.jit(lambda values: scene(jvr.Volume(values, OBLIQUE)))(with_gaps()),
     "lights": lights,
+    "shells": shells,
     "phases": phases,
     "gradient opacity": lambda: lit(
         transfer=jvr.GradientOpacity(linear_transfer(coloured=True), 0.1, 0.7),
@@ -421,7 +435,7 @@ EDITS = [
     (r'^kind = "LinearTransfer"', 'kind = "FitResult"', 'a.toml: transfer.kind: unknown choice "FitResult"; known: '),
     (r'^kind = "LinearTransfer"', 'kind = ["a"]', "a.toml: transfer.kind: unknown choice ['a']; known: "),
     (r'^kind = "LinearTransfer"', "", "a.toml: transfer.kind: missing; it says what this table describes: "),
-    (r'^interpolation = .*', "interpolation = 3", "a.toml: volume.interpolation: is 3; it must be one of Nearest, Trilinear"),
+    (r'^interpolation = .*', "interpolation = 3", "a.toml: volume.interpolation: is 3; it must be one of Nearest, Tricubic, Trilinear"),
     (r'^optical = .*', 'optical = "None"', "a.toml: optical: cannot be absent; it must be one of AbsorptionOnly, "),
     (r'"volume\.values"', '"../../etc/passwd"', 'there is no array the text "../../etc/passwd" in a.npz; known: volume.values'),
     (r'"volume\.values"', '["a"]', "a.toml: volume.values: an array beside the text has two keys, array and dtype"),

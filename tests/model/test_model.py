@@ -129,7 +129,7 @@ def test_a_table_is_exact_at_its_entries_and_clamps(make, coloured, x64):
     transfer = make(coloured=coloured)
     positions = np.asarray(transfer.positions)
     for i, s in [*enumerate(positions), (0, -1e9), (0, positions[0] - 1e-9), (-1, positions[-1] + 1e-9), (-1, 1e9)]:
-        rgb, sigma_t = transfer.evaluate(jnp.asarray(s))
+        rgb, sigma_t, _ = transfer.evaluate(jnp.asarray(s))
         # A position computed by linspace may be a rounding away from where the entry sits.
         np.testing.assert_allclose(rgb, transfer.rgb[i], atol=1e-14)
         np.testing.assert_allclose(sigma_t, np.atleast_1d(transfer.sigma_t[i]), atol=1e-14)
@@ -147,7 +147,7 @@ def test_control_points_are_exact_in_float32():
 
 def test_gaussians(x64):
     transfer = gaussian_transfer()
-    rgb, (sigma_t,) = transfer.evaluate(jnp.asarray(0.43))
+    rgb, (sigma_t,), _ = transfer.evaluate(jnp.asarray(0.43))
     each = np.asarray(transfer.height) * np.exp(-0.5 * ((0.43 - np.asarray(transfer.center)) / np.asarray(transfer.width)) ** 2)
     np.testing.assert_allclose(sigma_t, each.sum(), rtol=1e-14)
     np.testing.assert_allclose(rgb, each @ np.asarray(transfer.rgb) / each.sum(), rtol=1e-14)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import OBLIQUE, affine, linear_transfer, perspective, render, voxels
+from scipy import ndimage
 
 import jvr
 from jvr.march.fields import VoxelField
@@ -127,6 +128,44 @@ def test_precomputed_gradients_are_central_differences_at_voxels(x64):
     transfer = linear_transfer(coloured=True)
     of_opacity = [gradients(s(True), volume, p, transfer) for s in (jvr.CentralDifferences, jvr.PrecomputedGradient)]
     np.testing.assert_allclose(*of_opacity, atol=1e-12)
+
+
+def sobel_at_voxels(values):
+    """Sobel's differences at voxels by SciPy: of the mirrored border, where a difference of both sides is that of one twice."""
+    padded, found = np.pad(values, 1, mode="edge"), []
+    for axis in range(3):
+        smooth = padded
+        for other in {0, 1, 2} - {axis}:
+            smooth = ndimage.convolve1d(smooth, [0.25, 0.5, 0.25], axis=other)
+        inner = np.gradient(smooth[1:-1, 1:-1, 1:-1], axis=axis)
+        found.append(inner)
+    return np.stack(found, -1)
+
+
+def test_precomputed_sobel_gradients(x64):
+    """At voxels those of SciPy and of `SobelDifferences`, kept or not, along axes of one voxel too; between voxels interpolated."""
+    for shape in ((5, 6, 7), (4, 1, 5)):
+        volume = jvr.Volume(voxels(shape), slope=1.3, intercept=-0.1)
+        p = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3).astype(float)
+        sobel = jvr.PrecomputedGradient(sobel=True)
+        found = gradients(sobel, volume, p)
+        np.testing.assert_allclose(found, gradients(jvr.SobelDifferences(), volume, p), atol=1e-12)
+        np.testing.assert_allclose(gradients(sobel, volume.graded().graded_by_sobel(), p), found, atol=1e-12)
+        if min(shape) > 1:
+            np.testing.assert_allclose(found, 1.3 * sobel_at_voxels(volume.values).reshape(-1, 3), atol=1e-12)
+    between = gradients(sobel, volume, np.array([[1.25, 0.0, 2.0]]))
+    at = found.reshape(*shape, 3)
+    np.testing.assert_allclose(between[0], 0.75 * at[1, 0, 2] + 0.25 * at[2, 0, 2], atol=1e-12)
+
+
+def test_kept_sobel_gradients_follow_the_voxels():
+    """What is kept beside other voxels is never seen in their place, and both kinds may be kept."""
+    volume = jvr.Volume(voxels()).graded_by_sobel().graded()
+    other = eqx.tree_at(lambda v: v.values, volume, volume.values[::-1]).current()
+    assert other.sobel_gradients is not volume.sobel_gradients
+    np.testing.assert_array_equal(other.sobel_gradients, jvr.Volume(other.values).graded_by_sobel().sobel_gradients)
+    assert volume.current().sobel_gradients is volume.sobel_gradients
+    assert not np.array_equal(volume.sobel_gradients, volume.gradients)
 
 
 def test_the_analytic_gradient_is_that_of_the_interpolant(x64):

@@ -20,7 +20,7 @@ from jvr.io.config.environment import (
 from jvr.io.config.errors import ConfigError, blame
 from jvr.io.config.light import graded, light_parts, lights_of_views
 from jvr.io.config.load import Config, started
-from jvr.io.config.parts import made
+from jvr.io.config.parts import made, made_value
 from jvr.io.config.priors import priors_of, start_voxels, transforms_of
 from jvr.io.config.schema.transfer import TransferTable
 from jvr.io.config.schema.whole import FileTable, FitTable, VolumeTable
@@ -205,7 +205,7 @@ def _read(config: Config, table: VolumeTable, path: str) -> Volume:
 
 def _scene(config: Config, volume: Volume, transfer: AbstractTransfer) -> Scene:
     tables = config.tables
-    clipping = None if tables.clipping is None else made(config.where, "clipping", tables.clipping)
+    clipping = None if tables.clipping is None else made_value(config.where, "clipping", tables.clipping)
     light = light_parts(config, transfer) | environment_parts(config)
     fitted = () if tables.fit is None else tables.fit.unknowns
     if not any(name.startswith("volume.") for name in fitted):

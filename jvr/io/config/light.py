@@ -49,4 +49,6 @@ def graded(volume: Volume, parts: dict[str, Any], transfer: AbstractTransfer) ->
     """The volume with gradients at its voxels, where precomputed ones are asked for."""
     normals, others = parts.get("normals"), [parts[name] for name in ("scattering", "material") if name in parts]
     asked = "shading" in parts or transfer.takes_gradient or any(part.needs_gradient for part in others)
-    return volume.graded() if asked and isinstance(normals, PrecomputedGradient) and not normals.of_opacity else volume
+    if not asked or not isinstance(normals, PrecomputedGradient) or normals.of_opacity:
+        return volume
+    return volume.graded_by_sobel() if normals.sobel else volume.graded()

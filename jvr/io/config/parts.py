@@ -15,7 +15,7 @@ def made(where: Callable[[str], str], key: str, table: PartTable, *without: str)
     **Raises** `ConfigError` for what a constructor refuses, which names the key.
     """
     given = {name: value for name, value in table.given().items() if name not in without}
-    keywords = {name: _value(where, f"{key}.{name}", value) for name, value in given.items()}
+    keywords = {name: made_value(where, f"{key}.{name}", value) for name, value in given.items()}
     with blame(where(key), key):
         return table.part(**keywords)
 
@@ -35,9 +35,10 @@ def choices_of(part: Any) -> dict[str, Any]:
     return found
 
 
-def _value(where: Callable[[str], str], key: str, value: Any) -> Any:
+def made_value(where: Callable[[str], str], key: str, value: Any) -> Any:
+    """What the value of a key stands for: a table for a part, a list for what its entries stand for, anything else for itself."""
     if isinstance(value, PartTable):
         return made(where, key, value)
     if isinstance(value, list):
-        return [_value(where, f"{key}[{i}]", entry) for i, entry in enumerate(value)]
+        return [made_value(where, f"{key}[{i}]", entry) for i, entry in enumerate(value)]
     return value

@@ -52,7 +52,8 @@ def write_transfer(path: str | os.PathLike, transfer: AbstractTransfer) -> None:
     kind = next((kind for kind, name in KINDS[AbstractTransfer].items() if name == type(transfer).__name__), None)
     if kind is None:
         raise TypeError(f"{type(transfer).__name__} cannot be written as TOML")
-    lines += [f"{name} = {array_text(np.asarray(getattr(transfer, name)))}\n" for name in declared(type(transfer))]
+    arrays = {name: getattr(transfer, name) for name in declared(type(transfer))}
+    lines += [f"{name} = {array_text(np.asarray(array))}\n" for name, array in arrays.items() if array is not None]
     with replacing(path) as temporary:
         temporary.write_text("".join([HEADER, f'kind = "{kind}"\n', *lines]), encoding="utf-8")
 

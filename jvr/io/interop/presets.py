@@ -213,7 +213,7 @@ def _sampled(transfer: AbstractTransfer, preset: Preset, lost: dict[str, str]) -
             columns = np.column_stack([rgb, sigma])
             found = np.stack([np.interp(x, at, column) for column in columns.T], axis=1)
             return found[:, :3], found[:, 3:]
-        rgb, sigma = evaluate(x)
+        rgb, sigma, _ = evaluate(x)
         return np.stack(rgb, axis=1).astype(np.float64), np.stack(sigma, axis=1).astype(np.float64)
 
     rgb, sigma = rows(_positions(transfer))
@@ -223,6 +223,8 @@ def _sampled(transfer: AbstractTransfer, preset: Preset, lost: dict[str, str]) -
         lost["extinction"] = f"what is above {DEEPEST / preset.unit_distance:.4g} is opaque: give a smaller unit_distance"
     if np.any(rgb > 1):
         lost["colours"] = "what is brighter than 1 is cut"
+    if getattr(transfer, "emission", None) is not None:
+        lost["emission of its own"] = "media glow by their extinction alone there"
 
     def function(x: np.ndarray) -> Samples:
         rgb, sigma = rows(x)

@@ -9,6 +9,7 @@ import equinox as eqx
 
 from jvr.io.kinds import PARTS as PARTS
 from jvr.io.kinds import class_named as class_named
+from jvr.model.parameters import alternatives
 
 # How a file says that something is absent which would be there if nothing was said.
 NONE = "None"
@@ -28,14 +29,20 @@ def classes_of(annotation: Any) -> tuple[type, ...]:
 
 
 def implied(annotation: Any) -> type | None:
-    """The class of a part whose kind goes without saying: its field takes no other."""
+    """The class of a part whose kind goes without saying: its field takes no other, or names it beside the family that it belongs to."""
     found = classes_of(annotation)
-    return found[0] if len(found) == 1 and not inspect.isabstract(found[0]) else None
+    first = bool(found) and all(issubclass(found[0], other) for other in found)
+    return found[0] if first and not inspect.isabstract(found[0]) else None
 
 
 def entry_of(annotation: Any) -> Any:
-    """What each entry of a tuple takes, or `None` for fields that are no tuples."""
-    return typing.get_args(annotation)[0] if typing.get_origin(annotation) is tuple else None
+    """What each entry of a tuple takes, or `None` for fields that take no tuples."""
+    return next((typing.get_args(kind)[0] for kind in alternatives(annotation) if typing.get_origin(kind) is tuple), None)
+
+
+def takes_one(annotation: Any) -> bool:
+    """Whether a field takes a part that is in no tuple."""
+    return any(classes_of(kind) and typing.get_origin(kind) is not tuple for kind in alternatives(annotation))
 
 
 def fits(value: Any, annotation: Any) -> bool:

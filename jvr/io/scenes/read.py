@@ -9,7 +9,7 @@ import numpy as np
 
 from jvr.io.config.errors import ConfigError, blame, did_you_mean, shown
 from jvr.io.scenes.arrays import Arrays, number_type
-from jvr.io.scenes.kinds import NONE, PARTS, class_named, classes_of, entry_of, fits, implied, kinds_of, wanted
+from jvr.io.scenes.kinds import NONE, PARTS, class_named, classes_of, entry_of, fits, implied, kinds_of, takes_one, wanted
 from jvr.io.scenes.made import is_derived, is_static, made
 from jvr.model.parameters import takes_array
 
@@ -74,7 +74,7 @@ class Reader:
             if not fits(raw, annotation):
                 raise ConfigError(self.where, key, f"is {shown(raw)}; it must be {wanted(annotation)}")
             return raw
-        if entry is not None:
+        if entry is not None and (isinstance(raw, list) or not takes_one(annotation)):
             if not isinstance(raw, list):
                 raise ConfigError(self.where, key, f"must be a list of tables, not {shown(raw)}")
             return tuple(self.part(one, entry, f"{key}[{i}]") for i, one in enumerate(raw))

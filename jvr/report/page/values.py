@@ -18,11 +18,13 @@ from jvr.report.page.words import COLOURS, TITLES, entries_in_words, with_error
 # Longer tables are folded away until a reader opens them.
 OPEN_ROWS = 20
 MOST_ROWS = 1024
+# Fields that say where entries are.
+PLACES = ("positions", "center", "width")
 
 
 def transfer_values(transfer: AbstractTransfer, errors: dict[str, np.ndarray]) -> str:
     """A table of the transfer function's entries, one row each."""
-    names = [name for name in ("positions", "center", "width", "height", "sigma_t", "rgb") if hasattr(transfer, name)]
+    names = [name for name in (*PLACES, "height", "sigma_t", "emission", "rgb") if getattr(transfer, name, None) is not None]
     arrays = {name: np.asarray(getattr(transfer, name)) for name in names}
     if "rgb" not in arrays:
         return ""
@@ -41,7 +43,7 @@ def transfer_values(transfer: AbstractTransfer, errors: dict[str, np.ndarray]) -
     note = (
         "Each value with its standard error, which is that of weighted least squares at the solution and leaves out what the "
         "model itself cannot describe. Values without one were not fitted. Positions are in the volume's own units, extinctions "
-        "in 1 / world length (1 / mm for medical files), colours linear."
+        "in 1 / world length (1 / mm for medical files), emissions in radiance / world length, colours linear."
     )
     state, titles = " open" if len(rows) <= OPEN_ROWS else "", "".join(f"<th>{title}</th>" for title in head)
     return "\n".join(

@@ -8,7 +8,14 @@ import numpy as np
 from jvr.model.transfer import AbstractTable, AbstractTransfer, GaussianTransfer
 
 # What fields of a transfer function and the columns of a colour are called.
-TITLES = {"rgb": "colour", "sigma_t": "extinction", "height": "height", "center": "centre", "positions": "position"}
+TITLES = {
+    "rgb": "colour",
+    "sigma_t": "extinction",
+    "emission": "emission",
+    "height": "height",
+    "center": "centre",
+    "positions": "position",
+}
 COLOURS = ("red", "green", "blue")
 
 

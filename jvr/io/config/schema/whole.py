@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
@@ -14,7 +14,7 @@ from jvr.io.config.schema.table import Extinction, Position, Range, Scalar, Tabl
 from jvr.io.config.schema.transfer import Transfer
 from jvr.io.kinds import maker_of
 from jvr.model.camera import AbstractCamera
-from jvr.model.clipping import ClippingBox
+from jvr.model.clipping import AbstractClipping
 from jvr.model.interpolation import AbstractInterpolation
 from jvr.model.optical import AbstractOpticalModel
 from jvr.model.parameters import declared
@@ -235,6 +235,13 @@ class FitTable(Table):
         return self
 
 
+_Clipping = Annotated[Any, part(AbstractClipping, "box")]
+Clippings = Annotated[
+    Annotated[list[_Clipping], Field(min_length=1), Tag("(several)")] | Annotated[_Clipping, Tag("(one)")],
+    Discriminator(lambda value: "(several)" if isinstance(value, list) else "(one)"),
+]
+
+
 class ConfigTable(Table):
     """A whole configuration."""
 
@@ -243,7 +250,7 @@ class ConfigTable(Table):
     truth: Transfer | None = None
     background: Background | None = None
     optical: Annotated[Any, part(AbstractOpticalModel)] | None = None
-    clipping: Annotated[Any, only(ClippingBox)] | None = None
+    clipping: Clippings | None = None
     lights: Lights = Field(default=[])
     shading: Shading | None = None
     shadows: Shadows | None = None
