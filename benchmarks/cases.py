@@ -21,6 +21,7 @@ from benchmarks import scenes, yardsticks
 from benchmarks.light import light
 from benchmarks.poses import pose_step
 from benchmarks.preparation import preparation
+from benchmarks.surface_peers import surface_peers
 from benchmarks.surfaces import surfaces
 from benchmarks.timing import median, ratio, seconds
 from benchmarks.voxels import voxel_step
@@ -256,6 +257,7 @@ CASES = {
     "preparation": preparation,
     "light": light,
     "surfaces": surfaces,
+    "surface_peers": surface_peers,
     "fitting": fitting,
     "startup": startup,
 }

@@ -327,7 +327,7 @@ def main() -> None:
     parser.add_argument("--figure", metavar="FILE", help="PNG of PSNR over views and seconds, and of slices and pictures")
     parser.add_argument("--quick", action="store_true", help="few voxels, views and steps")
     arguments = parser.parse_args()
-    size, numbers, steps = (16, (4, 8), 3) if arguments.quick else (64, (8, 16, 32, 64), 16)
+    size, numbers, steps = (16, (4, 8), 5) if arguments.quick else (64, (8, 16, 32, 64), 16)
     rows, slices, curve = absorption(size, numbers, steps)
     colours = coloured(*((9, 3, 12, 3) if arguments.quick else (33, 16, 64, 24)))
     show(rows)

@@ -101,6 +101,7 @@ if TYPE_CHECKING:
     from jvr.model.material import HarmonicMaterial as HarmonicMaterial
     from jvr.model.material import MaterialByValue as MaterialByValue
     from jvr.model.merl import MerlBRDF as MerlBRDF
+    from jvr.model.mesh import Mesh as Mesh
     from jvr.model.microfacet import MicrofacetBRDF as MicrofacetBRDF
     from jvr.model.mie import Draine as Draine
     from jvr.model.mie import JendersieEon as JendersieEon

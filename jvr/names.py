@@ -80,6 +80,7 @@ NAMES = {
     "jvr.model.light": ("AmbientLight", "DirectionalLight", "HeadLight", "PointLight", "SpotLight", "disc_light", "sphere_light"),
     "jvr.model.material": ("HarmonicMaterial", "MaterialByValue"),
     "jvr.model.merl": ("MerlBRDF",),
+    "jvr.model.mesh": ("Mesh",),
     "jvr.model.microfacet": ("MicrofacetBRDF",),
     "jvr.model.mie": ("Draine", "JendersieEon", "TabulatedPhase"),
     "jvr.model.normals": (

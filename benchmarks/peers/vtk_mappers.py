@@ -21,7 +21,7 @@ class _Window:
 
     def __init__(self, scene: Scene, mapper: vtk.vtkFixedPointVolumeRayCastMapper | vtk.vtkGPUVolumeRayCastMapper):
         self.scene, self.mapper, self.look = scene, mapper, vtk.vtkVolumeProperty()
-        self.mapper.SetInputData(_image_data(scene))
+        self.mapper.SetInputData(image_data(scene.voxels, scene.spacing, scene.origin))
         self.look.SetInterpolationTypeToLinear()
         self.look.ShadeOff()
         volume, renderer, self.window = vtk.vtkVolume(), vtk.vtkRenderer(), vtk.vtkRenderWindow()
@@ -49,14 +49,19 @@ class _Window:
         self.window.WaitForCompletion()
 
     def picture(self) -> np.ndarray:
-        reader = vtk.vtkWindowToImageFilter()
-        reader.SetInput(self.window)
-        reader.ReadFrontBufferOff()
-        reader.ShouldRerenderOff()
-        reader.Update()
-        scalars = numpy_support.vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars())
-        # VTK's row 0 is at the bottom.
-        return scalars.reshape(self.scene.view.height, self.scene.view.width, 3)[::-1] / 255
+        return shown(self.window)
+
+
+def shown(window: vtk.vtkRenderWindow) -> np.ndarray:
+    """What a window shows, row 0 at the top."""
+    reader = vtk.vtkWindowToImageFilter()
+    reader.SetInput(window)
+    reader.ReadFrontBufferOff()
+    reader.ShouldRerenderOff()
+    reader.Update()
+    scalars = numpy_support.vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars())
+    width, height = window.GetSize()
+    return scalars.reshape(height, width, 3)[::-1] / 255
 
 
 class Renderer(_Window):
@@ -102,12 +107,12 @@ class GpuRenderer(_Window):
         return next((line.split(":", 1)[1].strip() for line in report.splitlines() if "renderer string" in line), "unknown")
 
 
-def _image_data(scene: Scene) -> vtk.vtkImageData:
+def image_data(voxels: np.ndarray, spacing: tuple[float, ...], origin: tuple[float, ...]) -> vtk.vtkImageData:
     data = vtk.vtkImageData()
-    data.SetDimensions(*scene.voxels.shape)
-    data.SetSpacing(*scene.spacing)
-    data.SetOrigin(*scene.origin)
-    data.GetPointData().SetScalars(numpy_support.numpy_to_vtk(scene.voxels.ravel(order="F"), deep=True))
+    data.SetDimensions(*voxels.shape)
+    data.SetSpacing(*spacing)
+    data.SetOrigin(*origin)
+    data.GetPointData().SetScalars(numpy_support.numpy_to_vtk(voxels.ravel(order="F"), deep=True))
     return data
 
 

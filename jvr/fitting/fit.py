@@ -248,6 +248,8 @@ def without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
 
 def _check(problem: Problem, solver: AbstractSolver, given: Targets, coarse_levels: int) -> bool:
     """Refuses combinations that cannot work; whether derivatives are taken in forward mode."""
+    if problem.settings.pixel_samples > 1:
+        raise ValueError("a fit compares one ray a pixel with its target: leave Settings(pixel_samples=...) at 1")
     is_least_squares = isinstance(solver, ChunkedLeastSquares) or (
         isinstance(solver, OptimistixSolver) and isinstance(solver.solver, optx.AbstractLeastSquaresSolver)
     )

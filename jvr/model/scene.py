@@ -53,7 +53,7 @@ class Scene(AbstractPart):
     - `material`: what a point makes of the environment's light: a BRDF such as `jvr.MicrofacetBRDF(...)`, `jvr.HarmonicMaterial`,
       `jvr.MaterialByValue`, or `None`.
     - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
-    - `geometry`: opaque geometry that rays end at, `jvr.DepthImage`, or `None`.
+    - `geometry`: opaque geometry that rays end at, `jvr.DepthImage`, `jvr.Mesh`, or `None`.
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
       `jvr.ForwardDifferences()`, `jvr.CentralDifferences()`, `jvr.SobelDifferences()`, `jvr.PrecomputedGradient()`.
     - `surfaces`: `jvr.Isosurfaces(...)`, shaded as the medium is, or `None`.
@@ -78,7 +78,7 @@ class Scene(AbstractPart):
     environment: EnvironmentLight | EnvironmentMap | None = parameter(doc="a jvr.EnvironmentLight or a jvr.EnvironmentMap")
     material: AbstractMaterial | None = parameter(doc="one of jvr's")
     radiance_transfer: AbstractRadianceTransfer | None = parameter(doc="a jvr.RadianceTransfer")
-    geometry: AbstractGeometry | None = parameter(doc="a jvr.DepthImage")
+    geometry: AbstractGeometry | None = parameter(doc="a jvr.DepthImage or a jvr.Mesh")
     surfaces: AbstractSurfaces | None = parameter(doc="jvr.Isosurfaces(...)")
 
     def __init__(

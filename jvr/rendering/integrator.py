@@ -23,6 +23,7 @@ from jvr.model.scene import Scene
 from jvr.numerics import divide_or_zero
 from jvr.rendering.image import Rendering, RenderStats
 from jvr.rendering.medium import Prepared, prepare
+from jvr.rendering.supersampling import filtered, finer
 from jvr.rendering.trace import camera_rays, near_volume
 from jvr.types import Scalar
 
@@ -131,7 +132,10 @@ class AbstractRayIntegrator(AbstractIntegrator):
 def make_picture(scene: Scene, camera: AbstractCamera, settings: "Settings", step: Scalar | float) -> Rendering:
     """The picture that the integrator of `settings` makes. Traceable. `settings`: with a step of 1, in place of which there is `step`."""
     scene, camera = near_volume(scene, camera)
-    return settings.sampling.picture(View(scene, camera, settings, step * jnp.min(scene.volume.spacing)))
+    n = settings.pixel_samples
+    view = View(scene, camera if n == 1 else finer(camera, n), settings, step * jnp.min(scene.volume.spacing))
+    picture = settings.sampling.picture(view)
+    return picture if n == 1 else filtered(picture, n)
 
 
 compiled_picture = program(make_picture, static_argnums=2)

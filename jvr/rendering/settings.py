@@ -35,6 +35,8 @@ class Settings(AbstractPart):
       zero where a brick has nothing else. 0 leaves out nothing that has a derivative.
     - `adjoint`: how derivatives are computed: `jvr.Replay()` (both modes, default), `jvr.Forward()` or `jvr.Rows()`.
     - `sampling`: which samples are taken: `jvr.Uniform()` (default: all), `jvr.Refinement()` or `jvr.Slices()`.
+    - `pixel_samples`: `n`, for `n x n` rays a pixel, on a regular grid, of which the pixel is the mean: edges without steps, at `n^2` times
+      the time. Fits and geometry by pixels (`jvr.DepthImage`) want 1, a ray through the middle.
     - `tile`: rays marched at a time. Memory is about 120 bytes a ray; smaller tiles need less and take longer.
 
     **Raises** `ValueError` for values out of range.
@@ -48,6 +50,7 @@ class Settings(AbstractPart):
     adjoint: AbstractAdjoint = parameter(doc="jvr.Replay(), jvr.Forward() or jvr.Rows()")
     sampling: AbstractIntegrator = parameter(doc="jvr.Uniform(), jvr.Refinement() or jvr.Slices()")
     tile: int = choice(AT_LEAST_ONE, doc="rays at a time")
+    pixel_samples: int = choice(AT_LEAST_ONE, doc="rays a pixel along rows and along columns", most=64)
 
     def __init__(
         self,
@@ -60,9 +63,10 @@ class Settings(AbstractPart):
         adjoint: AbstractAdjoint = Replay(),
         sampling: AbstractIntegrator = Uniform(),
         tile: int = 262_144,
+        pixel_samples: int = 1,
     ):
         assign(self, step=step, termination=termination, quadrature=quadrature, skipping=skipping)
-        assign(self, negligible=negligible, adjoint=adjoint, sampling=sampling, tile=tile)
+        assign(self, negligible=negligible, adjoint=adjoint, sampling=sampling, tile=tile, pixel_samples=pixel_samples)
         if negligible and not skipping:
             raise ValueError("negligible bricks can only be left out with skipping=True")
         if negligible and not isinstance(quadrature, Midpoint):
@@ -71,7 +75,10 @@ class Settings(AbstractPart):
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         absorbs, ends = scene.optical.absorbs, self.termination > 0
         limit = f"rays end at transmittance {self.termination:g}" if ends else "rays run to their end"
+        n = self.pixel_samples
+        several = () if n == 1 else (PlanEntry("supersampling", True, f"{n} x {n} rays a pixel"),)
         return (
+            *several,
             PlanEntry("empty-space skipping", self.skipping, self._skipped(scene)),
             PlanEntry("early termination", ends and absorbs, limit if absorbs else "nothing absorbs"),
         )

@@ -171,6 +171,7 @@ SCENES = {
     "negative": lambda: natural(environment=jvr.EnvironmentLight(-0.0 * np.ones((4, 3)), clamped=False)),
     "seen": lambda: natural(environment=(sky := jvr.EnvironmentMap(voxels((4, 8, 3)), order=2)), background=sky),
     "geometry": lambda: scene(geometry=jvr.DepthImage(np.where(voxels((3, 4)) < 0.5, np.inf, 2.0), voxels((3, 4, 3)))),
+    "mesh": lambda: scene(geometry=jvr.Mesh(voxels((4, 3)), [[0, 1, 2], [1, 2, 3]], voxels((4, 3)))),
     "materials": materials,
     "projected": projected,
     "frozen": frozen,

@@ -220,6 +220,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "LambertBRDF": {},
     "LinearTransfer": {"positions": [0.0, 1.0], "rgb": RGB, "sigma_t": [0.1, 0.2], "emission": RGB},
     "LutTransfer": {"rgb": RGB, "sigma_t": [0.1, 0.2], "domain": [0.0, 1.0], "emission": RGB},
+    "Mesh": {"vertices": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], "faces": [[0, 1, 2]], "rgb": [0.1, 0.2, 0.3]},
     "MaterialByValue": {"positions": [0.0, 1.0], "materials": [jvr.LambertBRDF(), jvr.LambertBRDF()]},
     "MerlBRDF": {"table": np.full((2, 2, 2, 3), 0.1)},
     "MicrofacetBRDF": {},
@@ -264,6 +265,7 @@ FORBIDDEN = {
 UNDECLARED = {
     ("HarmonicMaterial", "tinted"): "made by project",
     ("HarmonicMaterial", "plain"): "made by project",
+    ("Mesh", "faces"): "whole numbers, checked on their own",
     ("PrecomputedGradient", "gradients"): "made of a volume",
     ("Volume", "values"): "voxels of any type, checked on their own",
     ("Volume", "world_from_grid"): "an affine transform, checked on its own",

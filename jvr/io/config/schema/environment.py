@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Discriminator, Field, PlainValidator, Tag,
 
 from jvr.io.config.checks import number, numbers, problem
 from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, PartTable, checked_table, part, table_of
-from jvr.io.config.schema.table import Colour, Positions, Steepness, Table, one_or_more
+from jvr.io.config.schema.table import Colour, Position, Positions, Steepness, Table, one_or_more
 from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
 from jvr.model.environment import EnvironmentLight
 from jvr.model.environment_map import EnvironmentMap
@@ -65,7 +65,21 @@ class GeometryImageTable(KindTable):
     source: str | None = None
 
 
-BASES[AbstractGeometry, "image"] = GeometryImageTable
+class MeshTable(KindTable):
+    """`jvr.Mesh`."""
+
+    vertices: Annotated[list[Position], Field(min_length=1)]
+    faces: Annotated[list[list[int]], Field(min_length=1)]
+    rgb: Colour | list[Colour]
+
+    @staticmethod
+    def part(**keywords: Any) -> Any:
+        from jvr.model.mesh import Mesh
+
+        return Mesh(**keywords)
+
+
+BASES[AbstractGeometry, "image"], WRITTEN[AbstractGeometry] = GeometryImageTable, {"mesh": MeshTable}
 Geometry = Annotated[Any, part(AbstractGeometry)]
 BASES |= {EnvironmentLight: EnvironmentTable, (EnvironmentLight, "image"): ImageTable}
 BASES |= {EnvironmentMap: SurroundingsTable, (EnvironmentMap, "image"): SurroundingsImageTable}
