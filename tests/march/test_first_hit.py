@@ -124,9 +124,9 @@ def test_a_plane_is_hit_exactly_without_a_further_sample():
 
 
 def test_hits_lie_on_the_triangles_of_marching_cubes():
-    """Whose vertices lie where the surface crosses an edge between voxels. Between them they are flat, which is less than a tenth of a voxel
-    away from a surface that is curved as little as this one."""
-    x, y, z = grid() / 2
+    """Whose vertices lie where the surface crosses an edge between voxels. Between them they are flat, which is less than a tenth of a
+    voxel away from a surface that is curved as little as this one."""
+    x, y, z = grid() / 3
     values, rays, level = np.sin(0.9 * x + 0.4) * np.cos(0.7 * y) + 0.6 * np.sin(0.8 * z - 0.3 * x), rays_through(), 0.2
     vertices, faces, _, _ = marching_cubes(values, level)
     weights = np.array([(i, j, 16 - i - j) for i in range(17) for j in range(17 - i)]) / 16
