@@ -25,7 +25,19 @@ html_theme_options = {"top_of_page_buttons": []}
 html_copy_source = False
 html_math_renderer = "mathml"
 
-GUIDE = ("rendering", "light", "environment_lighting", "surfaces", "fitting", "voxels", "derivatives", "files", "speed", "peers")
+GUIDE = (
+    "rendering",
+    "light",
+    "occlusion",
+    "environment_lighting",
+    "surfaces",
+    "fitting",
+    "voxels",
+    "derivatives",
+    "files",
+    "speed",
+    "peers",
+)
 CONTENTS = {
     "Guide": [f"docs/{name}" for name in GUIDE],
     "Reference": [f"docs/reference/{name}" for name in reference.PARTS],

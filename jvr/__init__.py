@@ -7,7 +7,10 @@ from jvr.names import NAMES
 
 if TYPE_CHECKING:
     from jvr.effects.deep_shadow_map import DeepShadowMap as DeepShadowMap
+    from jvr.effects.histogram_occlusion import HistogramOcclusion as HistogramOcclusion
+    from jvr.effects.histogram_occlusion import LocalHistograms as LocalHistograms
     from jvr.effects.isosurfaces import Isosurfaces as Isosurfaces
+    from jvr.effects.occlusion import LocalOcclusion as LocalOcclusion
     from jvr.effects.phenomenological import PhenomenologicalBSDF as PhenomenologicalBSDF
     from jvr.effects.radiance_transfer import MaterialBleeding as MaterialBleeding
     from jvr.effects.radiance_transfer import RadianceTransfer as RadianceTransfer

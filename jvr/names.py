@@ -26,6 +26,8 @@ class Renamed:
 
 NAMES = {
     "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
+    "jvr.effects.histogram_occlusion": ("HistogramOcclusion", "LocalHistograms"),
+    "jvr.effects.occlusion": ("LocalOcclusion",),
     "jvr.effects.isosurfaces": ("Isosurfaces",),
     "jvr.effects.phenomenological": ("PhenomenologicalBSDF",),
     "jvr.effects.radiance_transfer": ("MaterialBleeding", "RadianceTransfer", "TransferBleeding"),

@@ -111,6 +111,23 @@ def mean_depth(tau: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(thin, series, 1 / large - decay / (1 - decay))
 
 
+@jax.custom_jvp
+def mean_transmittance(tau: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The mean of the transmittance along a homogeneous segment of optical depth `tau`: `phi1(tau) = (1 - exp(-tau)) / tau`, 1 at 0.
+
+    Its derivative is `-phi1(tau) mean_depth(tau)`: that of the quotient cancels in thin segments.
+    """
+    is_clear = tau == 0
+    return jnp.where(is_clear, 1.0, one_minus_exp(tau) / jnp.where(is_clear, 1.0, tau))
+
+
+@mean_transmittance.defjvp
+def _mean_transmittance_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (tau,), (tangent,) = primals, tangents
+    mean = mean_transmittance(tau)
+    return mean, -mean * mean_depth(tau) * tangent
+
+
 def normalise(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Unit vector; zero stays zero, with derivative zero. Scaled first, so that squares neither overflow nor underflow."""
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1, keepdims=True))

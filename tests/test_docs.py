@@ -29,7 +29,7 @@ from jvr.io.config.schema.parts import kinds_of, table_for
 from jvr.march.differentiation import AbstractAdjoint
 from jvr.march.quadrature import AbstractQuadrature
 from jvr.model.camera import AbstractCamera
-from jvr.model.effects import AbstractShading, AbstractShadows
+from jvr.model.effects import AbstractOcclusion, AbstractShading, AbstractShadows
 from jvr.model.environment import EnvironmentLight
 from jvr.model.environment_map import EnvironmentMap
 from jvr.model.geometry import AbstractGeometry
@@ -176,6 +176,7 @@ FAMILIES = {
     "[[lights]]": AbstractLight,
     "[shading]": AbstractShading,
     "[shadows]": AbstractShadows,
+    "[occlusion]": AbstractOcclusion,
     "[scattering.phase]": AbstractPhase,
     "[normals]": AbstractNormals,
     "[material]": AbstractBRDF,

@@ -12,6 +12,7 @@ import jvr
 from experiments import (
     contact_sheet,
     convergence,
+    occlusion_accuracy,
     other_renderers,
     phase_recovery,
     pose_recovery,
@@ -152,6 +153,18 @@ def test_relighting_runs(monkeypatch, tmp_path):
     assert exact["determined"] == 12
     assert exact["coefficients"] < without["coefficients"]
     assert all(exact[key]["psnr"] > without[key]["psnr"] for key in ("held_out", "relit"))
+
+
+@pytest.mark.slow
+def test_the_accuracy_of_occlusion_runs(monkeypatch, tmp_path):
+    result, size = ran(occlusion_accuracy, monkeypatch, tmp_path)
+    assert size > 10_000
+    for subject in result["subjects"]:
+        rows = {(row["method"], row["knob"]): row for row in subject["rows"]}
+        local = rows["local", "default"]
+        assert max(local["rmse_seen"], local["rmse_matter"]) < 0.5 * min(subject["without"].values())
+        # More directions are nearer to all of them.
+        assert rows["local", "rays 8"]["rmse_matter"] > local["rmse_matter"]
 
 
 @pytest.mark.slow

@@ -229,7 +229,7 @@ def plan(
         start_jax()
         config = load(given, sets or [])
         scene = build_scene(config)
-        if scene.environment_light is not None:
+        if scene.is_precomputable:
             from jvr.io.precompute import as_precomputed
 
             # The plan of what the other commands compile; it needs no numbers.

@@ -1,4 +1,4 @@
-"""What a command computes before its pictures: projected materials and radiance transfer, kept in the user's cache."""
+"""What a command computes before its pictures: projected materials, radiance transfer, occlusion; kept in the user's cache."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +15,12 @@ class Beforehand:
         self.report: list[dict[str, Any]] = []
 
     def __call__(self, scene: "Scene", **keywords: Any) -> "Scene":
-        if scene.environment_light is None:
+        if not scene.is_precomputable:
             return scene
         from jvr.io.precompute import precompute
 
         note = lambda part: self.report.append(part._asdict())
-        with bar("environment lighting") as show:
+        with bar("environment lighting" if scene.environment_light is not None else "occlusion") as show:
             return precompute(scene, cache=cache_folder("precomputed"), progress=show, report=note, **keywords)
 
 

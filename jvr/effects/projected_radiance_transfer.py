@@ -1,12 +1,9 @@
 """Radiance transfer as it was projected: coefficients at the nodes of a grid, and what they were made of."""
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, UInt32
 
 from jvr.model.harmonics.basis import count
@@ -49,15 +46,6 @@ class ProjectedRadianceTransfer(eqx.Module):
     def nbytes(self) -> int:
         """Memory of the coefficients."""
         return sum(x.size * x.dtype.itemsize for x in (self.luminance, self.chroma, self.solid, self.facing) if x is not None)
-
-    def is_for(self, cache_key: UInt32[Array | np.ndarray, "parts 2"]) -> Any:
-        """Whether it was made of what has these checksums: a `bool`, or a traced one."""
-        now, then = cache_key, self.cache_key
-        if now.shape != then.shape:
-            return False
-        if isinstance(now, Tracer) or isinstance(then, Tracer):
-            return jnp.all(now == then)
-        return bool(np.all(np.asarray(now) == np.asarray(then)))
 
     def separated(self, order: int) -> "ProjectedRadianceTransfer":
         """The same as luma, and colour differences up to an order (YCoCg, whose inverse is exact)."""

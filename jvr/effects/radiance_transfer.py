@@ -6,22 +6,18 @@ between nodes.
 
 import dataclasses
 import math
-import warnings
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, UInt32
 
 from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.model.dipole import Dipole
-from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer
+from jvr.model.effects import AbstractBleeding, AbstractRadianceTransfer, stale_message
+from jvr.model.grids import node_shape
 from jvr.model.harmonics.basis import count
-from jvr.model.kept import content
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import AbstractPart, Knob, multiples
 from jvr.model.ranges import AT_LEAST_ONE, POSITIVE, TRANSMITTANCE, Interval
@@ -122,36 +118,10 @@ class RadianceTransfer(AbstractRadianceTransfer):
             raise ValueError("chromaticity must be None or an order up to that of the luminance, and needs bleeding")
         self.projected = None
 
-    def stale(self, scene: Any) -> tuple[str, ...]:
-        if self.projected is None or np.all(self.projected.is_for(self.cache_key(scene))):
-            return ()
-        return (self._stale,)
-
-    def checked(self, scene: Any) -> "RadianceTransfer":
-        if self.projected is None:
-            return self
-        fits, is_pinned = self.projected.is_for(self.cache_key(scene)), self.projected.pinned
-        if isinstance(fits, Tracer):
-            if is_pinned:
-                return self
-            proven = eqx.error_if(self.projected.luminance, ~fits, self._stale)
-            return eqx.tree_at(lambda t: t.projected.luminance, self, proven)
-        if not fits and not is_pinned:
-            raise ValueError(self._stale)
-        if not fits:
-            warnings.warn(self._stale, RuntimeWarning, stacklevel=4)
-        return self
-
-    def pinned(self) -> "RadianceTransfer":
-        return self if self.projected is None else self.with_projected(dataclasses.replace(self.projected, pinned=True))
-
     @property
-    def _stale(self) -> str:
+    def stale_message(self) -> str:
         what = ("transfer function", "volume", "clipping box", *(["material"] if self.rays_need_gradient else []), "or dipole")
-        return (
-            f"the radiance transfer was computed for another {', '.join(what)}: call jvr.precompute(scene) again, or, to see the scene "
-            "with that of the other one, replace radiance_transfer by radiance_transfer.pinned()"
-        )
+        return stale_message("radiance transfer", "radiance_transfer", ", ".join(what))
 
     def knobs(self, scene: Any) -> tuple[Knob, ...]:
         product = (Knob("exact", (False, True), True),) if self.exact else ()
@@ -196,16 +166,9 @@ class RadianceTransfer(AbstractRadianceTransfer):
     def _medium(self, scene: Any, path: LightPath) -> Medium:
         return path(scene.transfer.takes_gradient or self.rays_need_gradient)
 
-    def with_projected(self, projected: ProjectedRadianceTransfer) -> "RadianceTransfer":
-        return eqx.tree_at(lambda t: t.projected, self, projected, is_leaf=lambda x: x is None)
-
     @property
     def rays_need_gradient(self) -> bool:
         return self.bleeding is not None and self.bleeding.reads_material
-
-    @property
-    def is_frozen(self) -> bool:
-        return self.projected is not None
 
     def transfer_function(self, scene: Any) -> AbstractTransfer:
         return scene.transfer if self.projected is None else self.projected.transfer
@@ -216,8 +179,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
 
     def shape(self, volume: Volume) -> tuple[int, int, int]:
         """Nodes along each axis."""
-        x, y, z = (1 if n == 1 else max(2, math.ceil((n - 1) * self.resolution) + 1) for n in volume.shape)
-        return x, y, z
+        return node_shape(volume, self.resolution)
 
     def node_width(self, volume: Volume) -> Scalar:
         """The least distance of two nodes, in the world."""
@@ -237,10 +199,6 @@ class RadianceTransfer(AbstractRadianceTransfer):
                 f"radiance transfer would take {needed / 1e9:.2g} GB, more than memory={self.memory:.2g} bytes: "
                 f"a resolution of {fits:.2f} fits, or raise memory"
             )
-
-    def cache_key(self, scene: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
-        """Checksums of all that a projection depends on."""
-        return content(self.sources(scene))
 
     def sources(self, scene: Any) -> Any:
         volume = scene.volume

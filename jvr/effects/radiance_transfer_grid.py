@@ -8,19 +8,19 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jvr.effects.environment_lighting import EnvironmentLighting, albedo_of
 from jvr.effects.grid import Grid
+from jvr.effects.nodes import AbstractProjection
 from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
 from jvr.effects.radiance_transfer import RadianceTransfer
-from jvr.effects.radiance_transfer_nodes import CHUNK, node_positions, project_nodes
+from jvr.effects.radiance_transfer_nodes import project_nodes
 from jvr.execution.devices import over_rays, shares
-from jvr.execution.tiles import dealt, joined
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.steps import Point, Transmittances
 from jvr.model.clipping import Clipping
+from jvr.model.grids import Shape, nodes_for_each_voxel
 from jvr.model.harmonics.algebra import product_matrix
 from jvr.model.harmonics.basis import band_of, basis
 from jvr.model.scene import Scene
@@ -55,7 +55,7 @@ def radiance_transfer_visibility(scene: Scene, medium: Medium) -> RadianceTransf
     material = scene.material
     projected = radiance_transfer.projected
     if projected is None:
-        projected = finished(scene, *project_all(RadianceTransferProjection.of(scene, medium)))
+        projected = finished(scene, *RadianceTransferProjection.of(scene, medium).all_nodes())
     elif radiance_transfer.scattering is not None and not projected.scattered:
         projected = scattered(scene, projected)
     coefficients, light = projected.coefficients, environment.coefficients
@@ -68,9 +68,8 @@ def radiance_transfer_visibility(scene: Scene, medium: Medium) -> RadianceTransf
         )
     if material.needs_gradient:
         incident = jnp.concatenate([incident, projected.solid[..., None]], axis=-1)
-    shape = coefficients.shape[:3]
-    x, y, z = ((m - 1) / (n - 1) if n > 1 else 0.0 for n, m in zip(scene.volume.shape, shape, strict=True))
-    return RadianceTransferVisibility(Grid.of(incident), (x, y, z))
+    x, y, z = coefficients.shape[:3]
+    return RadianceTransferVisibility(Grid.of(incident), nodes_for_each_voxel(scene.volume, (x, y, z)))
 
 
 def radiance_transfer_of(scene: Scene) -> RadianceTransfer:
@@ -86,7 +85,7 @@ def projected_of(scene: Scene) -> ProjectedRadianceTransfer:
     return projected
 
 
-class RadianceTransferProjection(eqx.Module):
+class RadianceTransferProjection(AbstractProjection):
     """All that the nodes of a scene are projected with. `albedo`: what a material reflects of light of one from everywhere, where rays
     pick that up; `surfaces`: whether the material has a normal."""
 
@@ -103,57 +102,22 @@ class RadianceTransferProjection(eqx.Module):
         radiance_transfer = radiance_transfer_of(scene)
         radiance_transfer.check_memory(scene.volume, scene.transfer)
         assert scene.material is not None
-        return cls(radiance_transfer, scene.volume, scene.clipping, medium, albedo_of(scene), scene.material.needs_gradient)
+        return cls(
+            radiance_transfer=radiance_transfer,
+            volume=scene.volume,
+            clipping=scene.clipping,
+            medium=medium,
+            albedo=albedo_of(scene),
+            surfaces=scene.material.needs_gradient,
+        )
 
-    def positions(self) -> np.ndarray:
-        return node_positions(self.volume, self.radiance_transfer.shape(self.volume))
-
-    def all_nodes(self) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
-        """`project_all` of it."""
-        return project_all(self)
-
-    def nodes(self, index: Int[Array, "nodes"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
-        """The radiance transfer of some nodes, a chunk at a time."""
-        fill = -index.shape[0] % CHUNK
-        chunks = jnp.pad(jnp.asarray(self.positions())[index], ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3)
-        found = jax.lax.map(lambda p: self.project(p), chunks)
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: index.shape[0]], found)
+    @property
+    def shape(self) -> Shape:
+        return self.radiance_transfer.shape(self.volume)
 
     def project(self, p: Float[Array, "nodes 3"]) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
         """The radiance transfer at grid positions."""
         return project_nodes(self.radiance_transfer, self.volume, self.clipping, self.medium, self.albedo, self.surfaces, p)
-
-    def active(self) -> Bool[Array, "nodes"]:
-        """Nodes with something visible no further away than the next node."""
-        p, occupancy = jnp.asarray(self.positions()), self.medium.occupancy
-        if occupancy is None:
-            return jnp.ones(p.shape[0], bool)
-        bricks, shape = occupancy.empty_radius.shape, self.radiance_transfer.shape(self.volume)
-        b = [jnp.clip((p[:, i] / occupancy.size).astype(jnp.int32), 0, n - 1) for i, n in enumerate(bricks)]
-        near = max((n - 1) / max(m - 1, 1) for n, m in zip(self.volume.shape, shape, strict=True))
-        return occupancy.empty_radius[b[0], b[1], b[2]] <= math.ceil(near / occupancy.size)
-
-
-def project_all(projection: RadianceTransferProjection) -> tuple[Float[Array, "nodes channels bands"], Float[Array, "nodes 4"]]:
-    """The radiance transfer of all nodes, zero where nothing is to be seen; chunks without an active node are left out. Traceable."""
-    p, active = projection.positions(), projection.active()
-    fill = -len(p) % CHUNK
-    chunks = jnp.asarray(np.pad(p, ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3))
-    busy = jnp.pad(active, (0, fill)).reshape(-1, CHUNK)
-    # Not the bound method: JAX hashes what it is to call, and Equinox all that a method is bound to.
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda p: projection.project(p), chunks[0]))
-
-    def share(projection: RadianceTransferProjection, inputs: tuple[Array, Array]) -> Any:
-        def chunk(inputs: tuple[Array, Array]) -> Any:
-            p, busy = inputs
-            found = jax.lax.cond(jnp.any(busy), lambda p: projection.project(p), lambda p: blank, p)
-            return jax.tree.map(lambda x: jnp.where(busy.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0), found)
-
-        return jax.lax.map(chunk, inputs)
-
-    order = dealt(len(chunks), shares())
-    found = joined(over_rays(share, projection, (chunks[order], busy[order])), len(chunks), shares())
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(p)], found)
 
 
 def finished(

@@ -25,8 +25,6 @@ from jvr.types import Channels, Triple
 
 Numbers: TypeAlias = Float[Array, "..."]
 
-# Nodes that are projected together in one program.
-CHUNK = 256
 # A change of transparency that is a smaller fraction of `RadianceTransfer.surface` is none: it moves the cone's rim by less than 1e-6.
 FLAT = 1e-3
 # Of such changes, those of a larger fraction than this have a direction.
@@ -40,12 +38,6 @@ class Cone(NamedTuple):
 
     axis: Triple
     sine: Numbers
-
-
-def node_positions(volume: Volume, shape: tuple[int, int, int]) -> np.ndarray:
-    """Grid positions of the nodes, `(nodes, 3)`: equally distant, the first and the last at the border."""
-    axes = [np.linspace(0, n - 1, m) if n > 1 else np.zeros(1) for n, m in zip(volume.shape, shape, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
 
 
 def project_nodes(

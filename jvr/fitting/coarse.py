@@ -83,9 +83,9 @@ def averaged(cameras: Cameras, given: Targets, factor: int) -> tuple[list[np.nda
 
 def blurred_volume(scene: Scene, cameras: Cameras, factor: int) -> Volume:
     """The volume averaged over blocks of voxels of about the size of `factor` pixels at its centre, at least one voxel each. As it is where
-    voxels cannot be averaged: labels, voxels without data, and where a radiance transfer was computed for them."""
+    voxels cannot be averaged: labels, voxels without data, and where something was computed for them."""
     volume = scene.volume
-    if not isinstance(volume.interpolation, Trilinear) or volume.gaps is not None or scene.radiance_transfer is not None:
+    if not isinstance(volume.interpolation, Trilinear) or volume.gaps is not None or scene.precomputable:
         return volume
     size = factor * float(np.median([_pixel_size(camera, np.asarray(volume.center)) for camera in cameras]))
     wanted = np.rint(size / np.asarray(volume.spacing))

@@ -235,11 +235,12 @@ def _choose(
 
 
 def without_stale(model: ExposedModel, chosen: Unknowns) -> ExposedModel:
-    """The model without what was computed of the unknowns' start and would stay so: what its volume keeps, and a radiance transfer, which
-    is taken as it is."""
-    transfer = lambda m: m.scene.radiance_transfer
-    if model.scene.radiance_transfer is not None and chosen.among(model, lambda m: transfer(m).sources(m.scene)):
-        model = eqx.tree_at(transfer, model, model.scene.radiance_transfer.pinned())
+    """The model without what was computed of the unknowns' start and would stay so: what its volume keeps, and precomputed parts, which
+    are taken as they are."""
+    for field in model.scene.precomputable:
+        part = lambda m, field=field: getattr(m.scene, field)
+        if chosen.among(model, lambda m, part=part: part(m).sources(m.scene)):
+            model = eqx.tree_at(part, model, part(model).pinned())
     if chosen.among(model, lambda m: m.scene.volume):
         kept = lambda m: (m.scene.volume.bricks, m.scene.volume.gradients, m.scene.volume.sobel_gradients)
         model = eqx.tree_at(kept, model, (None, None, None), is_leaf=lambda x: x is None)

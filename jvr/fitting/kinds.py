@@ -126,9 +126,9 @@ def march_unknowns(problem: Problem) -> int:
 
 def adjoint_of(problem: Problem) -> AbstractAdjoint:
     """How the whole residual vector is differentiated."""
-    # Rows do not know light that changes on its way: that of an environment, through a radiance transfer.
+    # Rows do not know light that changes on its way: that of an environment, through a radiance transfer; ambient light.
     of_scene = lambda s: (s.environment, s.environment_lights, s.radiance_transfer)
-    around = lambda m: () if m.scene.radiance_transfer is None else of_scene(m.scene)
+    around = lambda m: (() if m.scene.radiance_transfer is None else of_scene(m.scene), m.scene.occlusion)
     known = _has_rows(problem) and not problem.unknowns.among(problem.model, around) and problem.model.views is None
     return Rows() if known else Forward()
 
@@ -145,7 +145,7 @@ def _after_march(problem: Problem) -> frozenset[int]:
 def has_table_jacobian(scene: Scene) -> bool:
     """Whether entries of the transfer function act through what a sample is classified as, and nothing else."""
     by_gradient = scene.needs_gradient and scene.normals.follows_transfer(scene.volume)
-    shade = scene.shadows is not None or (scene.radiance_transfer is not None and not scene.radiance_transfer.is_frozen)
+    shade = scene.shadows is not None or any(not getattr(scene, field).is_frozen for field in scene.precomputable)
     return isinstance(scene.transfer, AbstractTable) and not shade and not by_gradient
 
 

@@ -97,8 +97,9 @@ class LightTangents(NamedTuple):
 
 def light_tangents(problem: Problem, values: Float[Array, "unknowns"]) -> LightTangents | None:
     """What `normal_equations` of all chunks need at one point, or `None` where that is nothing worth keeping."""
-    transfer = problem.model.scene.radiance_transfer
-    return None if transfer is None or transfer.is_final else _light_tangents(problem, values)
+    scene = problem.model.scene
+    is_made = all(getattr(scene, field).is_final for field in scene.precomputable)
+    return None if is_made else _light_tangents(problem, values)
 
 
 @eqx.filter_jit

@@ -14,6 +14,7 @@ from jvr.model.camera import AbstractCamera
 from jvr.model.clipping import AbstractClipping
 from jvr.model.effects import (
     AbstractBleeding,
+    AbstractOcclusion,
     AbstractRadianceTransfer,
     AbstractScattering,
     AbstractShading,
@@ -81,6 +82,7 @@ KINDS: dict[type, dict[str, str]] = {
         "precomputed": "PrecomputedGradient",
     },
     AbstractRadianceTransfer: {"projected": "RadianceTransfer"},
+    AbstractOcclusion: {"local": "LocalOcclusion", "histogram": "HistogramOcclusion"},
     AbstractTransfer: {
         "linear": "LinearTransfer",
         "lut": "LutTransfer",

@@ -1,4 +1,5 @@
-"""What depends on neither camera nor light, computed once: projected materials and radiance transfer, kept on disk by their content."""
+"""What depends on neither camera nor light, computed once: projected materials, radiance transfer, occlusion; kept on disk by their
+content."""
 
 import dataclasses
 import hashlib
@@ -19,12 +20,11 @@ from jaxtyping import Array
 from jvr.atomic import replacing
 from jvr.execution.devices import everywhere, over_rays, shares
 from jvr.model.scene import Scene
-from jvr.model.volume import Volume
 from jvr.rendering.medium import absorbing, occupancy
 from jvr.rendering.settings import Settings
 
 # Changes whenever what is computed from the same inputs does: what was kept before is then of no use.
-VERSION = 3
+VERSION = 4
 # Order that materials are kept at under an environment of a lower one.
 LEAST_ORDER = 3
 # Nodes in a program of their own, between two reports of progress.
@@ -34,8 +34,8 @@ Progress = Callable[[float], Any]
 
 
 class Precomputed(NamedTuple):
-    """One part that was computed beforehand: `part`, "material" or "radiance transfer"; `seconds` that it took; `cached`, whether it was
-    read from the folder; `nbytes` of its numbers."""
+    """One part that was computed beforehand: `part`, "material", "radiance transfer" or "occlusion"; `seconds` that it took; `cached`,
+    whether it was read from the folder; `nbytes` of its numbers."""
 
     part: str
     seconds: float
@@ -52,89 +52,63 @@ def precompute(
     keep_material: bool = False,
     keep_unscattered: bool = False,
 ) -> Scene:
-    """The scene with its material projected on harmonics and its radiance transfer computed, so that pictures from any camera and under
-    any environment do neither again. The material is kept up to order 3, or that of the environment (with an exact product, of the
-    transfer) where it is higher: of an environment of a still higher order no more than that is seen.
+    """The scene with its material projected on harmonics, its radiance transfer and its occlusion computed, so that pictures from any
+    camera and under any light do none of it again. The material is kept up to order 3, or that of the environment (with an exact product,
+    of the transfer) where it is higher: of an environment of a still higher order no more than that is seen.
 
-    Both are constants from then on. After a change of the volume, the transfer function or the clipping box call it again, which computes
+    All are constants from then on. After a change of the volume, the transfer function or the clipping box call it again, which computes
     what is of another scene anew (else `jvr.render` raises); a new material asks for it only with `jvr.MaterialBleeding()`. After a change
-    of the settings of `radiance_transfer`, begin with a scene that has not been through here.
+    of the settings of `radiance_transfer` or `occlusion`, begin with a scene that has not been through here.
 
     **Arguments:** `cache`: a folder to keep results in, named by the content of what they were computed from; `progress`: called with the
     share that is done, 0 ... 1; `report`: called with each part once it is there; `keep_material`: leave the material as it is, and
     `keep_unscattered`: leave the scattering pass to each picture, so that material and dipole can be fitted.
     Not traceable. Warns where a result cannot be written. **Raises** `OSError` where the folder cannot be made.
     """
-    if scene.environment_light is None:
+    if not scene.is_precomputable:
         return scene
     scene = dataclasses.replace(scene, volume=scene.volume.current())
     folder = None if cache is None else Path(cache)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     report = report or (lambda done: None)
-    if not keep_material:
+    if scene.environment_light is not None and not keep_material:
         order = _material_order(scene)
         material = (scene.material, np.asarray(order))
         project = lambda inputs: inputs[0].projected(order)
         projected = _kept(folder, project, material, lambda: _projected(scene.material, order), "material", report)
         scene = dataclasses.replace(scene, material=projected)
-    if scene.radiance_transfer is None:
-        return scene
-    if scene.radiance_transfer.is_frozen:
-        if not scene.radiance_transfer.stale(scene):
-            return scene
-        scene = eqx.tree_at(lambda s: s.radiance_transfer.projected, scene, None)
-    radiance_transfer = scene.radiance_transfer
-    assert radiance_transfer is not None
-    if keep_unscattered and radiance_transfer.scattering is not None:
-        scene = eqx.tree_at(lambda s: s.radiance_transfer.scattering, scene, None)
-    # The light plays no part, and the material where rays do not pick up its colour none but that it has a normal.
-    plays, normal = (
-        radiance_transfer.bleeding is not None and radiance_transfer.bleeding.reads_material,
-        scene.material is not None and scene.material.needs_gradient,
-    )
-    inputs = (
-        _bare(scene.volume),
-        scene.transfer,
-        scene.clipping,
-        scene.normals,
-        scene.radiance_transfer,
-        scene.material if plays else np.asarray(normal),
-    )
-    whole = lambda _: _finished(scene, *_projection(scene).all_nodes())
-    projected = _kept(
-        folder, whole, inputs, lambda: _project(scene, progress or (lambda share: None)), "radiance transfer", report
-    )
-    return dataclasses.replace(scene, radiance_transfer=radiance_transfer.with_projected(projected))
+    for field in scene.precomputable:
+        part = getattr(scene, field)
+        if part.is_frozen and not part.stale(scene):
+            continue
+        part = bare = part.with_projected(None)
+        if keep_unscattered and getattr(part, "scattering", None) is not None:
+            bare = eqx.tree_at(lambda p: p.scattering, part, None)
+        asked = dataclasses.replace(scene, **{field: bare})
+        whole = lambda _, asked=asked, field=field: _finished(asked, field, *_projection(asked, field).all_nodes())
+        compute = lambda asked=asked, field=field: _project(asked, field, progress or (lambda share: None))
+        projected = _kept(folder, whole, (bare, bare.sources(asked)), compute, field.replace("_", " "), report)
+        scene = dataclasses.replace(scene, **{field: part.with_projected(projected)})
+    return scene
 
 
 _projected = jax.jit(lambda material, order: material.projected(order), static_argnums=1)
 
 
-def _bare(volume: Volume) -> Volume:
-    """The volume without what it keeps of its voxels."""
-    kept = lambda v: (v.bricks, v.squares, v.gradients, v.sobel_gradients)
-    return eqx.tree_at(kept, volume, (None, None, None, None), is_leaf=lambda x: x is None)
-
-
 def as_precomputed(scene: Scene) -> Scene:
     """A scene of the same structure as `precompute` makes of it, at once and with zeros for what it computes: for `jvr.plan`."""
-    if scene.environment_light is None:
-        return scene
-    order = _material_order(scene)
 
     def shaped(scene: Scene) -> Any:
-        assert scene.material is not None
-        scene = dataclasses.replace(scene, material=scene.material.projected(order))
-        if scene.radiance_transfer is None or scene.radiance_transfer.is_frozen:
-            return scene.material, None
-        return scene.material, _finished(scene, *_projection(scene).all_nodes())
+        if scene.environment_light is not None:
+            assert scene.material is not None
+            scene = dataclasses.replace(scene, material=scene.material.projected(_material_order(scene)))
+        fields = [field for field in scene.precomputable if not getattr(scene, field).is_frozen]
+        return scene.material, {field: _finished(scene, field, *_projection(scene, field).all_nodes()) for field in fields}
 
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(shaped, scene))
-    scene = dataclasses.replace(scene, material=zeros[0])
-    if zeros[1] is None or scene.radiance_transfer is None:
-        return scene
-    return dataclasses.replace(scene, radiance_transfer=scene.radiance_transfer.with_projected(zeros[1]))
+    material, parts = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(shaped, scene))
+    made = {field: getattr(scene, field).with_projected(projected) for field, projected in parts.items()}
+    return dataclasses.replace(scene, material=material, **made)
 
 
 def _material_order(scene: Scene) -> int:
@@ -142,38 +116,36 @@ def _material_order(scene: Scene) -> int:
     return max(scene.material_order, LEAST_ORDER)
 
 
-def _projection(scene: Scene) -> Any:
-    """What the nodes of a scene are projected with."""
-    assert scene.radiance_transfer is not None
+def _projection(scene: Scene, field: str) -> Any:
+    """What the nodes of a part of a scene are computed with."""
     where = occupancy(scene, Settings())
-    return scene.radiance_transfer.projection(scene, lambda graded: absorbing(scene, where, graded))
+    return getattr(scene, field).projection(scene, lambda graded: absorbing(scene, where, graded))
 
 
-def _finished(scene: Scene, *nodes: Array) -> Any:
-    assert scene.radiance_transfer is not None
-    return scene.radiance_transfer.finished(scene, *nodes)
+def _finished(scene: Scene, field: str, *nodes: Array) -> Any:
+    return getattr(scene, field).finished(scene, *nodes)
 
 
-def _project(scene: Scene, progress: Progress) -> Any:
-    """The radiance transfer of all nodes near which there is something to see, some at a time."""
-    projection = jax.jit(_projection)(scene)
+def _project(scene: Scene, field: str, progress: Progress) -> Any:
+    """A part at all nodes near which there is something to see, some at a time."""
+    projection = jax.jit(_projection, static_argnums=1)(scene, field)
     active = np.flatnonzero(np.asarray(projection.active()))
-    shape = jax.eval_shape(lambda projection: projection.all_nodes(), projection)
-    coefficients, around = (np.zeros(x.shape, x.dtype) for x in shape)
+    shapes = jax.eval_shape(lambda projection: projection.all_nodes(), projection)
+    held = [np.zeros(x.shape, x.dtype) for x in shapes]
     size = shares() * min(TOGETHER, -(-len(active) // shares()))
     for begin in range(0, len(active), size or 1):
         piece = active[begin : begin + size]
         # The last piece repeats its last node.
         index = np.pad(piece, (0, size - len(piece)), mode="edge")
-        found = _some(projection, jnp.asarray(index, jnp.int32))
-        coefficients[index], around[index] = map(np.asarray, found)
+        for array, found in zip(held, _some(projection, jnp.asarray(index, jnp.int32)), strict=True):
+            array[index] = np.asarray(found)
         progress((begin + len(piece)) / len(active))
-    return jax.jit(_finished)(scene, jnp.asarray(coefficients), jnp.asarray(around))
+    return jax.jit(_finished, static_argnums=1)(scene, field, *map(jnp.asarray, held))
 
 
 @jax.jit
-def _some(projection: Any, index: Array) -> tuple[Array, Array]:
-    """The radiance transfer of some nodes."""
+def _some(projection: Any, index: Array) -> tuple[Array, ...]:
+    """What some nodes hold."""
     return everywhere(over_rays(lambda projection, index: projection.nodes(index), projection, index))
 
 

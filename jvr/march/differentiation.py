@@ -72,9 +72,9 @@ def _jacobian_rule(options: MarchOptions, primals: Inputs, tangents: Any) -> tup
     medium, rays, dt = primals
     if jax.tree.leaves(tangents[0].visibility):
         raise ValueError(
-            "jvr.Rows() does not know shadows that change, nor a radiance transfer or its light: set "
+            "jvr.Rows() does not know shadows or occlusion that change, nor a radiance transfer or its light: set "
             "Settings(adjoint=jvr.Replay()), or jvr.Forward() for forward mode; for a transfer function alone, jvr.precompute(scene) "
-            "keeps the radiance transfer as it is"
+            "keeps occlusion and radiance transfer as they are"
         )
     rest_of_transfer, entries = _split_entries(tangents[0].transfer)
     if options.distance or not jax.tree.leaves(entries):

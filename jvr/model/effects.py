@@ -1,12 +1,18 @@
 """Interfaces of the effects, so that a scene can hold them and no module of theirs is imported where it does not."""
 
 import abc
+import dataclasses
+import warnings
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax
+from jax.core import Tracer
+from jaxtyping import Array, Float, UInt32
+from numpy import ndarray
 
+from jvr.model.kept import content, is_same_content
 from jvr.model.parts import AbstractPart, PlanEntry, spelling
 from jvr.names import Renamed
 from jvr.types import Channels, Scalar, Triple
@@ -159,7 +165,90 @@ class AbstractBleeding(eqx.Module):
     reads_material: ClassVar[bool]
 
 
-class AbstractRadianceTransfer(AbstractPart):
+class AbstractPrecomputable(AbstractPart):
+    """A part that is computed at the nodes of a grid, in each picture or once beforehand (`jvr.precompute`).
+
+    What was computed beforehand is a constant. It knows by checksums what of a scene it was made of, and a scene of other numbers is
+    refused until it is made anew or `pinned()`.
+    """
+
+    # What has been computed beforehand, or `None`: a module whose first leaf is an array that every picture reads, with the `cache_key` of
+    # what it was made of, and whether it is `pinned`.
+    projected: eqx.AbstractVar[Any]
+
+    @property
+    def is_frozen(self) -> bool:
+        """Whether it has been computed beforehand, so that it does not follow the scene."""
+        return self.projected is not None
+
+    @property
+    @abc.abstractmethod
+    def is_final(self) -> bool:
+        """Whether a picture has nothing left to do but to read it."""
+
+    @abc.abstractmethod
+    def projection(self, scene: Any, path: Any) -> Any:
+        """All that is needed to compute it, a pytree: `active()`, a mask of nodes that are worth it; `nodes(index)`, what some of them are;
+        `all_nodes()`, what all are. `path`: as of `visibility`."""
+
+    @abc.abstractmethod
+    def finished(self, scene: Any, *nodes: Any) -> Any:
+        """What `with_projected` takes, from what all nodes of the scene's projection are."""
+
+    @abc.abstractmethod
+    def sources(self, scene: Any) -> Any:
+        """The parts of a scene that it is computed from."""
+
+    @property
+    @abc.abstractmethod
+    def stale_message(self) -> str:
+        """What to say where it was computed for another scene."""
+
+    def with_projected(self, projected: Any) -> Any:
+        """The same, computed beforehand."""
+        return eqx.tree_at(lambda part: part.projected, self, projected, is_leaf=lambda x: x is None)
+
+    def pinned(self) -> Any:
+        """The same, to be taken as it is whatever becomes of the scene that it was computed for."""
+        return self if self.projected is None else self.with_projected(dataclasses.replace(self.projected, pinned=True))
+
+    def cache_key(self, scene: Any) -> UInt32[Array | ndarray, "parts 2"]:
+        """Checksums of all that it depends on."""
+        return content(self.sources(scene))
+
+    def stale(self, scene: Any) -> tuple[str, ...]:
+        """What has to be computed again for a scene of concrete arrays, in a sentence; empty where nothing has."""
+        if self.projected is None or is_same_content(self.cache_key(scene), self.projected.cache_key):
+            return ()
+        return (self.stale_message,)
+
+    def checked(self, scene: Any) -> Any:
+        """The same, for a scene that it has not been computed for an error: a `ValueError`, or, where that is traced, when the program
+        runs. Where it is `pinned` a warning, of concrete arrays."""
+        if self.projected is None:
+            return self
+        fits, is_pinned = is_same_content(self.cache_key(scene), self.projected.cache_key), self.projected.pinned
+        if isinstance(fits, Tracer):
+            if is_pinned:
+                return self
+            first = lambda part: jax.tree.leaves(part.projected)[0]
+            return eqx.tree_at(first, self, eqx.error_if(first(self), ~fits, self.stale_message))
+        if not fits and not is_pinned:
+            raise ValueError(self.stale_message)
+        if not fits:
+            warnings.warn(self.stale_message, RuntimeWarning, stacklevel=4)
+        return self
+
+
+def stale_message(name: str, field: str, sources: str) -> str:
+    """What to say of a part, in a field of a scene, that was computed for others of its sources."""
+    return (
+        f"the {name} was computed for another {sources}: call jvr.precompute(scene) again, or, to see the scene "
+        f"with that of the other one, replace {field} by {field}.pinned()"
+    )
+
+
+class AbstractRadianceTransfer(AbstractPrecomputable):
     """Radiance transfer: how the medium around a point changes the light of the environment that reaches it."""
 
     # Whether samples bring the light that reaches them, and not a fraction of all of it.
@@ -188,32 +277,9 @@ class AbstractRadianceTransfer(AbstractPart):
     def rays_need_gradient(self) -> bool:
         """Whether its own rays ask for gradients of what they pass."""
 
-    @property
-    @abc.abstractmethod
-    def is_frozen(self) -> bool:
-        """Whether it has been computed beforehand, so that it does not follow the transfer function."""
-
-    @property
-    @abc.abstractmethod
-    def is_final(self) -> bool:
-        """Whether a picture has nothing left to do but to multiply it with the light."""
-
     @abc.abstractmethod
     def visibility(self, scene: Any, path: Any) -> Any:
         """That of the scene's environment, as `AbstractPart.visibility`."""
-
-    @abc.abstractmethod
-    def projection(self, scene: Any, path: Any) -> Any:
-        """All that is needed to compute it, a pytree: `active()`, a mask of nodes that are worth it; `nodes(index)`, what some of them are;
-        `all_nodes()`, what all are. `path`: as of `visibility`."""
-
-    @abc.abstractmethod
-    def finished(self, scene: Any, *nodes: Any) -> Any:
-        """What `with_projected` takes, from what all nodes of the scene's projection are."""
-
-    @abc.abstractmethod
-    def with_projected(self, projected: Any) -> "AbstractRadianceTransfer":
-        """The same, computed beforehand."""
 
     @abc.abstractmethod
     def transfer_function(self, scene: Any) -> Any:
@@ -223,19 +289,20 @@ class AbstractRadianceTransfer(AbstractPart):
     def lift(self, volume: Any) -> Scalar:
         """How far above a surface, in the world, it is known what arrives."""
 
-    @abc.abstractmethod
-    def sources(self, scene: Any) -> Any:
-        """The parts of a scene that it is computed from."""
+
+class AbstractOcclusion(AbstractPrecomputable):
+    """Occlusion: how much of the ambient light the medium near a point takes away."""
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        made = "computed beforehand" if self.is_frozen else "computed in each picture: jvr.precompute"
+        return (PlanEntry(name, True, f"{spelling(self)}, {made}", ("ambient light", "short rays")),)
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        yield from self.stale(scene)
+
+    def without(self, scene: Any) -> Any:
+        return scene.replaced(occlusion=None)
 
     @abc.abstractmethod
-    def stale(self, scene: Any) -> tuple[str, ...]:
-        """What has to be computed again for a scene of concrete arrays, in a sentence; empty where nothing has."""
-
-    @abc.abstractmethod
-    def checked(self, scene: Any) -> "AbstractRadianceTransfer":
-        """The same, for a scene that it has not been computed for an error: a `ValueError`, or, where that is traced, when the program
-        runs. Where it is `pinned` a warning, of concrete arrays."""
-
-    @abc.abstractmethod
-    def pinned(self) -> "AbstractRadianceTransfer":
-        """The same, to be taken as it is whatever becomes of the scene that it was computed for."""
+    def visibility(self, scene: Any, path: Any) -> Any:
+        """That of the scene's ambient light, as `AbstractPart.visibility`."""

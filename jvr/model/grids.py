@@ -1,6 +1,7 @@
 """Grids over one domain: the voxels of a volume on a coarser or a finer grid."""
 
 import dataclasses
+import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +31,33 @@ def resampled(values: Float[Array, "x y z"], shape: Shape) -> Float[Array, "x2 y
     return values
 
 
+def resampled_cubic(nodes: Float[Array, "x y z channels"], shape: Shape) -> Float[Array, "x2 y2 z2 channels"]:
+    """Nodes on a finer grid over the same domain, by cubic convolution (Keys 1981): through all nodes, with a continuous slope, a quadratic
+    field is reproduced but for the cells at the border. Linear in the nodes and differentiable in them. What is interpolated may lie beyond
+    its nodes."""
+    for axis, (old, new) in enumerate(zip(nodes.shape, shape, strict=False)):
+        if old != new:
+            matrix = jnp.asarray(_cubic_matrix(old, new), nodes.dtype)
+            nodes = jnp.moveaxis(jnp.tensordot(matrix, nodes, (1, axis)), 0, axis)
+    return nodes
+
+
+def _cubic_matrix(old: int, new: int) -> Float[np.ndarray, "new old"]:
+    """What takes values along an axis to more of them. Beyond the border they go on in a straight line."""
+    place = np.linspace(0.0, old - 1.0, new)
+    low = np.clip(np.floor(place), 0, max(old - 2, 0)).astype(int)
+    t = place - low
+    weights = (-t + 2 * t**2 - t**3) / 2, 1 - (5 * t**2 - 3 * t**3) / 2, (t + 4 * t**2 - 3 * t**3) / 2, (t**3 - t**2) / 2
+    # One value more at either end.
+    padded = np.zeros((new, old + 2))
+    for i, weight in enumerate(weights):
+        padded[np.arange(new), low + i] += weight
+    matrix, first, last = padded[:, 1:-1].copy(), padded[:, :1], padded[:, -1:]
+    matrix[:, :2] += first * [2, -1]
+    matrix[:, -2:] += last * [-1, 2]
+    return matrix
+
+
 def on_grid(volume: Volume, shape: Shape) -> Volume:
     """The volume on another grid over the same domain, its voxels in floating point (`resampled`).
 
@@ -49,4 +77,22 @@ def on_grid(volume: Volume, shape: Shape) -> Volume:
 def coarser(shape: Shape) -> Shape:
     """The grid whose voxels lie twice as far apart, or a little less where the ends of an axis would not be among them."""
     x, y, z = (n // 2 + 1 if n > 1 else 1 for n in shape)
+    return x, y, z
+
+
+def node_shape(volume: Volume, resolution: float) -> Shape:
+    """The grid with so many nodes for each voxel along an axis, or a few more where the ends of an axis would not be among them."""
+    x, y, z = (1 if n == 1 else max(2, math.ceil((n - 1) * resolution) + 1) for n in volume.shape)
+    return x, y, z
+
+
+def node_positions(volume: Volume, shape: Shape) -> Float[np.ndarray, "nodes 3"]:
+    """Grid positions of the nodes of a grid over a volume: equally distant, the first and the last at the border."""
+    axes = [np.linspace(0, n - 1, m) if n > 1 else np.zeros(1) for n, m in zip(volume.shape, shape, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+
+
+def nodes_for_each_voxel(volume: Volume, shape: Shape) -> tuple[float, float, float]:
+    """What takes a grid position to the coordinates of such a grid's nodes, along each axis."""
+    x, y, z = ((m - 1) / (n - 1) if n > 1 else 0.0 for n, m in zip(volume.shape, shape, strict=True))
     return x, y, z

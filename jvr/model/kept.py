@@ -54,6 +54,15 @@ def content(tree: Any) -> UInt32[Array | np.ndarray, "parts 2"]:
     return np.stack(rows) if all(isinstance(row, np.ndarray) for row in rows) else jnp.stack([jnp.asarray(r) for r in rows])
 
 
+def is_same_content(one: UInt32[Array | np.ndarray, "parts 2"], other: UInt32[Array | np.ndarray, "others 2"]) -> Any:
+    """Whether two trees had the same `content`: a `bool`, or a traced one."""
+    if one.shape != other.shape:
+        return False
+    if isinstance(one, Tracer) or isinstance(other, Tracer):
+        return jnp.all(one == other)
+    return bool(np.all(np.asarray(one) == np.asarray(other)))
+
+
 def _known_checksum(array: Any) -> np.ndarray:
     key = id(array)
     known = _checksums.get(key)

@@ -212,7 +212,8 @@ class HeadLight(AbstractDeltaLight):
 
 
 class AmbientLight(AbstractLight):
-    """Ambient light: the same radiance from everywhere; nothing shades it. `radiance`: a number or `(3,)`, not negative.
+    """Ambient light: the same radiance from everywhere; what is near takes some of it where the scene has an `occlusion`.
+    `radiance`: a number or `(3,)`, not negative.
 
     It is shown by `Scene(shading=...)` and `Scene(scattering=...)`; materials show `jvr.EnvironmentLight.constant(radiance)`, which is the
     same light.

@@ -10,6 +10,8 @@ import equinox as eqx
 from jvr.model.clipping import AbstractClipping, ClippingBox
 from jvr.model.effects import (
     AbstractMaterial,
+    AbstractOcclusion,
+    AbstractPrecomputable,
     AbstractRadianceTransfer,
     AbstractScattering,
     AbstractShading,
@@ -53,13 +55,16 @@ class Scene(AbstractPart):
     - `material`: what a point makes of the environment's light: a BRDF such as `jvr.MicrofacetBRDF(...)`, `jvr.HarmonicMaterial`,
       `jvr.MaterialByValue`, or `None`.
     - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
+    - `occlusion`: how much of the ambient light the medium near a point takes away: `jvr.LocalOcclusion(...)`,
+      `jvr.HistogramOcclusion(...)`, or `None`: nothing.
     - `geometry`: opaque geometry that rays end at, `jvr.DepthImage`, `jvr.Mesh`, or `None`.
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
       `jvr.ForwardDifferences()`, `jvr.CentralDifferences()`, `jvr.SobelDifferences()`, `jvr.PrecomputedGradient()`.
     - `surfaces`: `jvr.Isosurfaces(...)`, shaded as the medium is, or `None`.
 
-    **Raises** `ValueError` for shadows without a light, or with nothing that shows light; for one of environment and material without
-    the other, and for radiance transfer without both; for surfaces between nearest voxels, or whose normals are those of the opacity.
+    **Raises** `ValueError` for shadows without a light, or with nothing that shows light; for occlusion without ambient light, or with
+    nothing that shows it; for one of environment and material without the other, and for radiance transfer without both; for surfaces
+    between nearest voxels, or whose normals are those of the opacity.
     """
 
     volume: Volume = parameter(doc="a jvr.Volume, as jvr.read_volume gives it")
@@ -78,6 +83,7 @@ class Scene(AbstractPart):
     environment: EnvironmentLight | EnvironmentMap | None = parameter(doc="a jvr.EnvironmentLight or a jvr.EnvironmentMap")
     material: AbstractMaterial | None = parameter(doc="one of jvr's")
     radiance_transfer: AbstractRadianceTransfer | None = parameter(doc="a jvr.RadianceTransfer")
+    occlusion: AbstractOcclusion | None = parameter(doc="one of jvr's")
     geometry: AbstractGeometry | None = parameter(doc="a jvr.DepthImage or a jvr.Mesh")
     surfaces: AbstractSurfaces | None = parameter(doc="jvr.Isosurfaces(...)")
 
@@ -98,6 +104,7 @@ class Scene(AbstractPart):
         material: AbstractMaterial | None = None,
         radiance_transfer: AbstractRadianceTransfer | None = None,
         geometry: AbstractGeometry | None = None,
+        occlusion: AbstractOcclusion | None = None,
         surfaces: AbstractSurfaces | None = None,
     ):
         # None of several is no clipping.
@@ -105,19 +112,30 @@ class Scene(AbstractPart):
         assign(self, volume=volume, transfer=transfer, background=background, optical=optical, clipping=clipping)
         assign(self, lights=lights, shading=shading, shadows=shadows, scattering=scattering, normals=normals)
         assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer, geometry=geometry)
-        assign(self, surfaces=surfaces)
+        assign(self, surfaces=surfaces, occlusion=occlusion)
         _check_light(self)
         _check_environment(self)
         _check_surfaces(self)
 
     def current(self) -> "Scene":
-        """The same scene with nothing in it that was computed for another: `Volume.current()`, and radiance transfer `checked`. What draws
-        a scene begins here."""
+        """The same scene with nothing in it that was computed for another: `Volume.current()`, and each precomputed part `checked`. What
+        draws a scene begins here."""
         volume = self.volume.current()
         scene = self if volume is self.volume else eqx.tree_at(lambda s: s.volume, self, volume)
-        if self.radiance_transfer is None:
-            return scene
-        return eqx.tree_at(lambda s: s.radiance_transfer, scene, self.radiance_transfer.checked(self))
+        for name in self.precomputable:
+            part = lambda s, name=name: getattr(s, name)
+            scene = eqx.tree_at(part, scene, part(self).checked(self))
+        return scene
+
+    @property
+    def is_precomputable(self) -> bool:
+        """Whether `jvr.precompute` has anything to do: projecting a material, or `precomputable` parts."""
+        return self.environment_light is not None or bool(self.precomputable)
+
+    @property
+    def precomputable(self) -> tuple[str, ...]:
+        """Fields of parts that `jvr.precompute` computes beforehand."""
+        return tuple(f.name for f in dataclasses.fields(self) if isinstance(getattr(self, f.name), AbstractPrecomputable))
 
     @property
     def shows_lights(self) -> bool:
@@ -148,6 +166,11 @@ class Scene(AbstractPart):
         return functools.reduce(EnvironmentLight.__add__, self.environment_lights) if self.environment_lights else None
 
     @property
+    def light_blocker(self) -> AbstractGeometry | None:
+        """The geometry that light does not get through: `None`, too, where it is known from the eye alone."""
+        return None if self.geometry is None or self.geometry.of_one_view else self.geometry
+
+    @property
     def shadow_casters(self) -> tuple[AbstractDeltaLight | None, ...]:
         """Its lights, `None` in the place of each that nothing shades."""
         return _casters(self.lights)
@@ -165,10 +188,12 @@ class Scene(AbstractPart):
 
     def replaced(self, **parts: Any) -> "Scene":
         """The scene with other parts, and without what these cannot carry: shadows go with the last light that casts them and the last part
-        that shows them, the material and the radiance transfer with the environment."""
+        that shows them, occlusion with the last ambient light or that part, material and radiance transfer with the environment."""
         light, shading, scattering = (parts.get(name, getattr(self, name)) for name in ("lights", "shading", "scattering"))
         if not any(_casters(light)) or (shading is None and scattering is None):
             parts["shadows"] = None
+        if not any(isinstance(one, AmbientLight) for one in light) or (shading is None and scattering is None):
+            parts["occlusion"] = None
         if not _environments(light, parts.get("environment", self.environment)):
             parts |= {"material": None, "radiance_transfer": None}
         return dataclasses.replace(self, **parts)
@@ -211,6 +236,11 @@ def _check_light(scene: Scene) -> None:
         )
     if scene.shadows is not None and scene.shading is None and scene.scattering is None:
         raise ValueError("nothing shows these shadows: set shading=jvr.Lambert() or scattering=jvr.SingleScattering()")
+    ambient = any(isinstance(light, AmbientLight) for light in scene.lights)
+    if scene.occlusion is not None and not ambient:
+        raise ValueError("occlusion is that of ambient light: add a jvr.AmbientLight to lights=, or leave occlusion out")
+    if scene.occlusion is not None and scene.shading is None and scene.scattering is None:
+        raise ValueError("nothing shows this occlusion: set shading=jvr.Lambert() or scattering=jvr.SingleScattering()")
 
 
 def _check_environment(scene: Scene) -> None:

@@ -16,13 +16,21 @@ import jvr
 from jvr.rendering.advise import effects_of, remarks_on
 
 MODULES = ("lighting", "shading", "scattering", "shadow_rays", "shadow_volume", "shadow_map", "deep_shadow_map", "light_space")
-MODULES += ("environment_lighting", "radiance_transfer", "radiance_transfer_grid", "diffusion")
+MODULES += (
+    "environment_lighting",
+    "radiance_transfer",
+    "radiance_transfer_grid",
+    "diffusion",
+    "occlusion",
+    "histogram_occlusion",
+)
 MODELS = ("material", "brdf", "microfacet", "merl", "dipole")
 LIGHT = {"lights": (jvr.DirectionalLight((0.3, -0.5, -1.0)), jvr.AmbientLight(0.2))}
 EFFECTS = {
     "shading": lambda: {"shading": jvr.BlinnPhong()},
     "scattering": lambda: {"scattering": jvr.SingleScattering(jvr.HenyeyGreenstein(0.4), 0.9)},
     "shadows": lambda: {"shading": jvr.Lambert(), "shadows": jvr.ShadowVolume(1.0)},
+    "occlusion": lambda: {"shading": jvr.Lambert(), "occlusion": jvr.LocalOcclusion(4, samples=2)},
     "gradient": lambda: {"transfer": jvr.GradientOpacity(transfer(), 0.01, 0.3)},
 }
 # Environment lighting in the air, on surfaces, and in the way of each other; each met once by every other effect.
@@ -33,7 +41,10 @@ ENVIRONMENT = {
         jvr.LambertBRDF(0.8), radiance_transfer=jvr.RadianceTransfer(1, 4, bleeding=jvr.TransferBleeding())
     ),
 }
-PAIRS = [*itertools.combinations(EFFECTS, 2), *zip(("haze", "surfaces", "radiance_transfer", "haze"), EFFECTS, strict=True)]
+PAIRS = [
+    *itertools.combinations(EFFECTS, 2),
+    *zip(("haze", "surfaces", "radiance_transfer", "haze", "haze"), EFFECTS, strict=True),
+]
 
 
 def transfer(scale=0.6):
@@ -92,7 +103,7 @@ def test_an_effect_is_in_the_program_only_where_the_scene_holds_it(names):
     assert program(lit) != plain_program()
     assert jvr.plan(lit) != jvr.plan(plain)
     absent = {"lights": (), "shading": None, "shadows": None, "scattering": None, "transfer": transfer()}
-    absent |= {"environment": None, "material": None, "radiance_transfer": None}
+    absent |= {"environment": None, "material": None, "radiance_transfer": None, "occlusion": None}
     restored = jvr.Scene(lit.volume, **absent)
     assert program(restored) == plain_program()
     assert jvr.plan(restored) == jvr.plan(plain)

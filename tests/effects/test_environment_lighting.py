@@ -15,7 +15,7 @@ from scenes import OBLIQUE, linear_transfer, perspective, rotation, voxels
 import jvr
 from jvr.effects.diffusion import kernel_of, scatter
 from jvr.effects.environment_lighting import environment_lighting
-from jvr.effects.radiance_transfer_grid import RadianceTransferProjection, project_all
+from jvr.effects.radiance_transfer_grid import RadianceTransferProjection
 from jvr.model.harmonics.projection import sphere_nodes
 from jvr.rendering.medium import absorbing
 
@@ -42,7 +42,7 @@ def picture(scene, settings=SETTINGS):
 def transfer_at(scene):
     """Coefficients at the nodes of a scene, `(nodes, channels, bands)`, and `solid` and `facing` side by side."""
     return jax.jit(
-        lambda s: project_all(RadianceTransferProjection.of(s, absorbing(s, None, s.radiance_transfer.rays_need_gradient)))
+        lambda s: RadianceTransferProjection.of(s, absorbing(s, None, s.radiance_transfer.rays_need_gradient)).all_nodes()
     )(scene)
 
 

@@ -112,10 +112,12 @@ TABLE = "{positions=[0.1,0.9],values=[0.2,0.4]}"
         ),
         ("shadows", "{kind='opacity-map',texels=64,layers=8}", jvr.OpacityShadowMap(64, 8)),
         ("shadows", "{kind='deep-map',texels=64,layers=8,error=0.02}", jvr.DeepShadowMap(64, 8, error=0.02)),
+        ("occlusion", "{rays=8,radius=3,gamma=2}", jvr.LocalOcclusion(8, radius=3, gamma=2)),
+        ("occlusion", "{kind='histogram',bins=8,bleeding=0.5}", jvr.HistogramOcclusion(8, bleeding=0.5)),
     ],
 )
 def test_a_part_is_a_name_or_a_table(key, text, wanted):
-    assert same(getattr(scene_of(LIT, f"{key}={text}"), key), wanted)
+    assert same(getattr(scene_of(LIT + "[[lights]]\nkind = 'ambient'\n", f"{key}={text}"), key), wanted)
 
 
 @pytest.mark.parametrize(
@@ -248,6 +250,8 @@ def test_a_transfer_function_of_the_gradient_survives_a_file_bit_by_bit(transfer
         ("shadows={rays={},volume={}}", "shadows", "'rays' and 'volume' exclude each other"),
         ("shadows={kind='map',rays={}}", "shadows", "'map' and 'rays' exclude each other"),
         ("shadows={rays={step=1}}", "shadows", 'such as [shadows] kind = "rays"'),
+        ("occlusion=locl", "occlusion", "did you mean 'local'?"),
+        ("occlusion={bins=4}", "occlusion.bins", 'only kind = "histogram" has it'),
         ("normals=sobol", "normals", "did you mean 'sobel'?"),
         ("normals={kind='sobel',of_opacty=true}", "normals.of_opacty", "did you mean 'of_opacity'?"),
         ("scatering={}", "scatering", "did you mean 'scattering'?"),
@@ -293,6 +297,8 @@ def test_mistakes_about_light_are_named(change, key, hint):
             "shadows",
             "nothing shows them",
         ),
+        (BASE + "[shading]\nkind = 'lambert'\n[occlusion]\n", "occlusion", 'add [[lights]] with kind = "ambient"'),
+        (BASE + "[[lights]]\nkind = 'ambient'\n[occlusion]\n", "occlusion", "nothing shows it"),
         (
             LIT + "[normals]\nof_opacity = true\n[transfer.gradient_opacity]\nlow = 0\nhigh = 1\n",
             "normals.of_opacity",

@@ -108,6 +108,14 @@ def frozen() -> jvr.Scene:
     return natural(radiance_transfer=transfer.with_projected(done))
 
 
+def histograms() -> jvr.Scene:
+    """With numbers in place of what `jvr.precompute` takes seconds for."""
+    weights = np.random.default_rng(8).random((3, 3, 4, 5)).astype(np.float32)
+    arrays = map(jnp.asarray, (weights, np.arange(5.0), 3.0, np.arange(12, dtype=np.uint32).reshape(6, 2)))
+    occlusion = jvr.HistogramOcclusion(5, resolution=0.4, bleeding=0.5).with_projected(jvr.LocalHistograms(*arrays, pinned=True))
+    return lit(lights=[jvr.AmbientLight()], occlusion=occlusion)
+
+
 def projected() -> jvr.Scene:
     parts = [jvr.HarmonicMaterial.project(brdf, 2, directions=4, nodes=8) for brdf in (jvr.PhongBRDF(), jvr.LambertBRDF(0.3))]
     return natural(material=jvr.MaterialByValue([0.2, 0.8], parts).projected(2))
@@ -167,6 +175,8 @@ SCENES = {
     "kept": lambda: lit(jvr.Volume(voxels(SHAPE)).bricked(3).graded(), normals=jvr.PrecomputedGradient()),
     "packed": lambda: scene(jvr.Volume(voxels(SHAPE), missing=3.0).packed().bricked()),
     "natural": lambda: natural(radiance_transfer=jvr.RadianceTransfer(exact=True)),
+    "occluded": lambda: lit(lights=[jvr.AmbientLight()], occlusion=jvr.LocalOcclusion(8, radius=2, samples=3, bias=0.1)),
+    "histograms": histograms,
     "isosurfaces": lambda: lit(surfaces=jvr.Isosurfaces((0.4, 0.6), voxels((2, 3)), (0.3, 1.0), band=0.2, step=0.5, most=2)),
     "negative": lambda: natural(environment=jvr.EnvironmentLight(-0.0 * np.ones((4, 3)), clamped=False)),
     "seen": lambda: natural(environment=(sky := jvr.EnvironmentMap(voxels((4, 8, 3)), order=2)), background=sky),

@@ -214,11 +214,13 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "HarmonicMaterial": {"tinted": None, "plain": None, "positions": [0.0, 1.0]},
     "HeadLight": {},
     "HenyeyGreenstein": {"g": 0.3},
+    "HistogramOcclusion": {"radius": 3.0, "offset": 0.5, "gamma": 2.0, "grain": 1.0, "bleeding": 0.5},
     "Isosurfaces": {"values": [0.0, 1.0], "rgb": RGB, "opacity": [0.5, 0.5], "band": 0.1},
     "JendersieEon": {"diameter": 10.0},
     "Lambert": {},
     "LambertBRDF": {},
     "LinearTransfer": {"positions": [0.0, 1.0], "rgb": RGB, "sigma_t": [0.1, 0.2], "emission": RGB},
+    "LocalOcclusion": {"radius": 3.0, "offset": 0.5, "gamma": 2.0},
     "LutTransfer": {"rgb": RGB, "sigma_t": [0.1, 0.2], "domain": [0.0, 1.0], "emission": RGB},
     "Mesh": {"vertices": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], "faces": [[0, 1, 2]], "rgb": [0.1, 0.2, 0.3]},
     "MaterialByValue": {"positions": [0.0, 1.0], "materials": [jvr.LambertBRDF(), jvr.LambertBRDF()]},
@@ -265,6 +267,10 @@ FORBIDDEN = {
 UNDECLARED = {
     ("HarmonicMaterial", "tinted"): "made by project",
     ("HarmonicMaterial", "plain"): "made by project",
+    ("LocalHistograms", "weights"): "made of a volume",
+    ("LocalHistograms", "positions"): "made of a volume",
+    ("LocalHistograms", "length"): "made of a volume",
+    ("LocalHistograms", "cache_key"): "made of a volume",
     ("Mesh", "faces"): "whole numbers, checked on their own",
     ("PrecomputedGradient", "gradients"): "made of a volume",
     ("Volume", "values"): "voxels of any type, checked on their own",
@@ -286,6 +292,7 @@ PLACES = {
     "AbstractBRDF": "material",
     "AbstractTransfer": "transfer",
     "AbstractRadianceTransfer": "radiance_transfer",
+    "AbstractOcclusion": "occlusion",
 }
 
 
@@ -394,7 +401,7 @@ def data_with(place: str, table: dict[str, Any]) -> dict[str, Any]:
     data: dict[str, Any] = {
         "volume": {"builtin": "demo"},
         "transfer": {"kind": "window"},
-        "lights": [{"kind": "directional", "direction": [0, 0, 1]}],
+        "lights": [{"kind": "directional", "direction": [0, 0, 1]}, {"kind": "ambient"}],
         "shading": {"kind": "lambert"},
         "environment": "constant",
         "material": "lambert",

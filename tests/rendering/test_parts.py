@@ -21,6 +21,7 @@ PARTS = {
         jvr.DeepShadowMap(3, 2, error=0.02),
     ),
     "normals": (jvr.AnalyticGradient(), jvr.CentralDifferences(True), jvr.SobelDifferences(), jvr.PrecomputedGradient()),
+    "occlusion": (jvr.LocalOcclusion(), jvr.HistogramOcclusion(2, 3, resolution=1.0)),
     "radiance_transfer": (
         jvr.RadianceTransfer(0, 1),
         jvr.RadianceTransfer(10, 8, 0.8, exact=True, bleeding=jvr.TransferBleeding(), chromaticity=10),

@@ -28,6 +28,8 @@ from jvr.model.material import AbstractBRDF
 from jvr.model.scene import Scene, material_order
 
 Precompute = Callable[..., Scene]
+# Parts of the scene that occlusion is computed from.
+SHAPES_OCCLUSION = ("transfer", "volume", "clipping", "occlusion")
 
 
 def environment_parts(config: Config) -> dict[str, Any]:
@@ -72,8 +74,8 @@ def geometry_of(config: Config) -> Any:
 
 
 def precomputed(scene: Scene, **keywords: Any) -> Scene:
-    """`jvr.precompute`, which is imported for scenes alone that have environment lighting."""
-    if scene.environment_light is None:
+    """`jvr.precompute`, which is imported for scenes alone that it has something to do in."""
+    if not scene.is_precomputable:
         return scene
     from jvr.io.precompute import precompute
 
@@ -94,11 +96,15 @@ def _shapes_radiance_transfer(table: RadianceTransferTable) -> tuple[str, ...]:
 
 def fit_scene(config: Config, scene: Scene, precompute: Precompute) -> Scene:
     """The scene that a fit starts from, with all computed beforehand that the fit does not change, or keeps as it is at its start."""
-    keep = {"keep_material": _fits(config, "material"), "keep_unscattered": _fits(config, "radiance_transfer")}
-    transfer, table = scene.radiance_transfer, config.tables.radiance_transfer
-    if table is None or table.frozen or not _fits(config, *_shapes_radiance_transfer(table)):
-        return precompute(scene, **keep)
-    return dataclasses.replace(precompute(dataclasses.replace(scene, radiance_transfer=None), **keep), radiance_transfer=transfer)
+    keep, table, later = {}, config.tables.radiance_transfer, {}
+    if scene.environment_light is not None:
+        keep = {"keep_material": _fits(config, "material"), "keep_unscattered": _fits(config, "radiance_transfer")}
+    if table is not None and not table.frozen and _fits(config, *_shapes_radiance_transfer(table)):
+        later["radiance_transfer"] = scene.radiance_transfer
+    # Occlusion follows the unknowns, as the light that it takes away is a part of what they explain.
+    if scene.occlusion is not None and _fits(config, *SHAPES_OCCLUSION):
+        later["occlusion"] = scene.occlusion
+    return dataclasses.replace(precompute(dataclasses.replace(scene, **dict.fromkeys(later)), **keep), **later)
 
 
 def _fits(config: Config, *parts: str) -> bool:

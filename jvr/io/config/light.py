@@ -1,4 +1,4 @@
-"""From tables to lights, shading, shadows, scattering, normals and surfaces. What a configuration does not name is not imported."""
+"""From tables to lights, shading, shadows, occlusion, scattering, normals and surfaces. What is not named is not imported."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ def light_parts(config: Config, transfer: AbstractTransfer) -> dict[str, Any]:
     tables, parts = config.tables, {}
     if tables.lights:
         parts["lights"] = _lights(config, tables.lights, "lights")
-    for name in ("shading", "shadows", "scattering", "normals", "surfaces"):
+    for name in ("shading", "shadows", "scattering", "normals", "surfaces", "occlusion"):
         if getattr(tables, name) is not None:
             parts[name] = made(config.where, name, getattr(tables, name))
     if transfer.takes_gradient and "normals" in parts and parts["normals"].of_opacity:

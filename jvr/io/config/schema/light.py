@@ -1,4 +1,4 @@
-"""Tables of everything about light: lights, shading, shadows, scattering, normals, surfaces.
+"""Tables of everything about light: lights, shading, shadows, occlusion, scattering, normals, surfaces.
 
 Most are those of classes (`jvr.io.config.schema.parts`); here is what says something else.
 """
@@ -13,7 +13,7 @@ from jvr.io.config.errors import shown
 from jvr.io.config.schema.parts import WRITTEN, KindTable, part
 from jvr.io.config.schema.table import Length, Position, one_or_more
 from jvr.io.kinds import KINDS
-from jvr.model.effects import AbstractScattering, AbstractShading, AbstractShadows, AbstractSurfaces
+from jvr.model.effects import AbstractOcclusion, AbstractScattering, AbstractShading, AbstractShadows, AbstractSurfaces
 from jvr.model.light import AbstractLight
 from jvr.model.normals import AbstractNormals
 from jvr.model.phase import AbstractPhase
@@ -105,6 +105,7 @@ OneOrMore = Annotated[list[Annotated[Any, part(AbstractLight)]], BeforeValidator
 Lights = Annotated[OneOrMore, Field(validate_default=True)]
 Shading = Annotated[Any, part(AbstractShading)]
 Shadows = Annotated[Any, part(AbstractShadows), BeforeValidator(_one_method)]
+Occlusion = Annotated[Any, part(AbstractOcclusion, "local")]
 Scattering = Annotated[Any, part(AbstractScattering, "single")]
 Normals = Annotated[Any, part(AbstractNormals, "analytic")]
 Surfaces = Annotated[Any, part(AbstractSurfaces, "isosurfaces")]

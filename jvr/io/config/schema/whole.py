@@ -8,7 +8,17 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 from jvr.io.config.checks import number, numbers, problem, whole
 from jvr.io.config.errors import shown
 from jvr.io.config.schema.environment import Background, Environments, Geometry, Material, RadianceTransfer
-from jvr.io.config.schema.light import Lights, Normals, OneOrMore, Scattering, Shading, Shadows, Surfaces, casts_shadows
+from jvr.io.config.schema.light import (
+    Lights,
+    Normals,
+    Occlusion,
+    OneOrMore,
+    Scattering,
+    Shading,
+    Shadows,
+    Surfaces,
+    casts_shadows,
+)
 from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, only, part
 from jvr.io.config.schema.table import Extinction, Position, Range, Scalar, Table, one_or_more
 from jvr.io.config.schema.transfer import Transfer
@@ -261,6 +271,7 @@ class ConfigTable(Table):
     material: Material | None = None
     radiance_transfer: RadianceTransfer | None = None
     geometry: Geometry | None = None
+    occlusion: Occlusion | None = None
     camera: Cameras = Field(default=[{}])
     settings: Annotated[Any, only(Settings)] = Field(default={}, validate_default=True)
     fit: FitTable | None = None
@@ -272,6 +283,10 @@ class ConfigTable(Table):
             raise problem('there is no light that casts them; add [[lights]] with kind = "directional", or "point"', "shadows")
         if self.shadows is not None and self.shading is None and self.scattering is None:
             raise problem("nothing shows them; add [shading] or [scattering]", "shadows")
+        if self.occlusion is not None and not any(light.kind == "ambient" for light in self.lights):
+            raise problem('it is that of ambient light; add [[lights]] with kind = "ambient"', "occlusion")
+        if self.occlusion is not None and self.shading is None and self.scattering is None:
+            raise problem("nothing shows it; add [shading] or [scattering]", "occlusion")
         if self.environment and self.material is None:
             raise problem('nothing shows it; add [material], such as kind = "lambert"', "environment")
         if self.material is not None and not self.environment:

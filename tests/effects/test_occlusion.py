@@ -1,0 +1,397 @@
+"""Ambient occlusion: closed forms, brute force in NumPy, derivatives, what is kept, hard cases."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import OBLIQUE, affine, linear_transfer, perspective, render, voxels
+from scipy.ndimage import map_coordinates
+
+import jvr
+from jvr.effects.histogram_occlusion import LocalHistograms
+from jvr.effects.occlusion import ProjectedOcclusion
+from jvr.io.precompute import as_precomputed
+from jvr.march.steps import Point
+from jvr.rendering.advise import effects_of, remarks_on
+from jvr.rendering.medium import absorbing
+
+SHAPE = (7, 7, 7)
+METHODS = {"local": jvr.LocalOcclusion, "histogram": jvr.HistogramOcclusion}
+
+
+def ambient():
+    return (jvr.AmbientLight((0.9, 0.6, 0.3)),)
+
+
+def and_sun():
+    return (*ambient(), jvr.DirectionalLight((0.3, -0.5, -1.0)))
+
+
+# Scenes of one structure, most of them: their numbers go through one program.
+
+
+def local(radius, offset=0.0, **numbers):
+    return jvr.LocalOcclusion(128, radius=radius, offset=offset, samples=8, resolution=1.0, **numbers)
+
+
+def scene(occlusion=None, shape=SHAPE, **parts):
+    given = {"volume": jvr.Volume(voxels(shape), OBLIQUE), "transfer": linear_transfer(), "lights": ambient()}
+    return jvr.Scene(**({"shading": jvr.Lambert(0.8), "occlusion": occlusion} | given | parts))
+
+
+def homogeneous(sigma, occlusion):
+    """One extinction wherever there is a volume."""
+    transfer = jvr.LinearTransfer([0.0, 0.3, 0.6, 1.0], [[1.0, 1.0, 1.0]] * 4, [sigma] * 4)
+    return scene(occlusion, volume=jvr.Volume(voxels(SHAPE)), transfer=transfer)
+
+
+@jax.jit
+def visibility(one: jvr.Scene):
+    return one.occlusion.visibility(one, lambda graded: absorbing(one, None, graded))
+
+
+def factors(one: jvr.Scene) -> np.ndarray:
+    """What every node leaves of ambient light, visible or not."""
+    grid = visibility(one).grid
+    return 1 - np.asarray(grid.rows, np.float64).reshape(*[n + 1 for n in grid.cells], -1)
+
+
+def picture(one: jvr.Scene) -> np.ndarray:
+    return np.asarray(render(one, perspective(one.volume)).rgb, np.float64)
+
+
+def phi1(x):
+    return np.where(np.equal(x, 0), 1.0, -np.expm1(-x) / np.where(np.equal(x, 0), 1.0, x))
+
+
+def on_the_sphere(count: int) -> np.ndarray:
+    """Directions at random."""
+    directions = np.random.default_rng(5).normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1)[:, None]
+
+
+def around(one: jvr.Scene, start, radius, offset, rays=4000, steps=48) -> tuple[np.ndarray, np.ndarray]:
+    """Scalars at distances along rays from a grid position, and which of them are inside, without jvr and in double precision."""
+    matrix, values = np.asarray(one.volume.world_from_grid, np.float64), np.asarray(one.volume.values, np.float64)
+    along = on_the_sphere(rays) @ np.linalg.inv(matrix[:3, :3]).T
+    at = start + along[:, None] * (offset + (radius - offset) * (np.arange(steps) + 0.5) / steps)[:, None]
+    inside = np.all((at >= 0) & (at <= np.array(values.shape) - 1), axis=-1)
+    return map_coordinates(values, at.reshape(-1, 3).T, order=1, mode="nearest").reshape(inside.shape), inside
+
+
+def brute_force(one: jvr.Scene, p: np.ndarray, radius: float, offset: float) -> np.ndarray:
+    """The factor at grid positions `(n, 3)`, by the midpoint rule along many rays."""
+    found = []
+    for start in p:
+        s, inside = around(one, start, radius, offset)
+        sigma = np.interp(s, np.asarray(one.transfer.positions), np.asarray(one.transfer.sigma_t))
+        dtau = np.where(inside, sigma, 0.0) * (radius - offset) / s.shape[1]
+        found.append(np.mean(np.exp(-(np.cumsum(dtau, axis=1) - 0.5 * dtau))))
+    return np.array(found)
+
+
+# --- Closed forms ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-3, 0.5, 20.0])
+def test_a_homogeneous_ball_has_the_closed_form(sigma):
+    """`phi1(sigma (R - a))` at a node whose ball lies in the volume; of grains of which each takes as much as it is opaque."""
+    grains = jvr.HistogramOcclusion(4, 64, radius=3.0, offset=0.5, samples=8, resolution=1.0, grain=0.7)
+    for occlusion, opaque in ((local(3.0, 0.5), sigma), (grains, -np.expm1(-0.7 * sigma) / 0.7)):
+        assert factors(homogeneous(sigma, occlusion))[3, 3, 3, 0] == pytest.approx(phi1(2.5 * opaque), abs=2e-6)
+
+
+def test_a_half_space_leaves_half():
+    """A node on a face of the volume, with nothing beyond: `(1 + phi1(sigma (R - a))) / 2`, a half where that is opaque; on an edge and
+    in a corner what is left is that of three and seven octants more."""
+    for sigma in (0.7, 60.0):
+        found, inside = factors(homogeneous(sigma, local(3.0)))[..., 0], phi1(3 * sigma)
+        # The two hemispheres about z have as many rays; about other axes within what 128 directions know.
+        assert found[3, 3, 0] == pytest.approx((1 + inside) / 2, abs=2e-6)
+        for node, share in (((0, 3, 3), 1 / 2), ((0, 0, 3), 1 / 4), ((0, 0, 0), 1 / 8)):
+            assert found[node] == pytest.approx(1 - share * (1 - inside), abs=0.012)
+
+
+def test_a_ball_larger_than_the_volume_sees_all_of_it():
+    """With all samples of a ray inside, what is left is the transmittance to where the volume ends."""
+    length = np.min(3 / np.abs(on_the_sphere(4000)), axis=1)
+    found = factors(homogeneous(0.3, local(1e6)))
+    assert found[3, 3, 3, 0] == pytest.approx(np.mean(np.exp(-0.3 * length)), abs=0.01)
+
+
+@pytest.mark.filterwarnings("ignore:the occlusion was computed for another")
+def test_ambient_light_alone_is_multiplied():
+    """With `(bias + (1 - bias) I)^gamma`."""
+
+    def drawn(taken, radiance=1.0, **numbers):
+        kept = ProjectedOcclusion(jnp.full((2, 2, 2, 1), taken), jnp.zeros((0, 2), jnp.uint32), pinned=True)
+        lights = (jvr.AmbientLight(radiance * ambient()[0].radiance), and_sun()[1])
+        return picture(scene(jvr.LocalOcclusion(**numbers).with_projected(kept), lights=lights))
+
+    sun, both = drawn(0.0, radiance=0.0), drawn(0.0)
+    np.testing.assert_allclose(both, picture(scene(lights=and_sun())), atol=1e-6)
+    np.testing.assert_allclose(drawn(1.0), sun, atol=1e-6)
+    assert np.ptp(both - sun) > 0.1
+    for numbers, factor in (({}, 0.25), ({"bias": 0.2}, 0.4), ({"bias": 0.2, "gamma": 0.5}, 0.4**0.5), ({"gamma": 2.0}, 0.0625)):
+        np.testing.assert_allclose(drawn(0.75, **numbers), sun + factor * (both - sun), atol=2e-6)
+
+
+def test_coloured_extinction_has_a_factor_for_each_channel():
+    table = linear_transfer()
+    with_sigma = lambda sigma_t: scene(local(4.0), transfer=jvr.LinearTransfer(table.positions, table.rgb, sigma_t))
+    apart = [factors(with_sigma(c * table.sigma_t)) for c in (1, 2, 3)]
+    found = factors(with_sigma(np.asarray(table.sigma_t)[:, None] * [1, 2, 3]))
+    np.testing.assert_allclose(found, np.concatenate(apart, axis=-1), atol=1e-6)
+
+
+# --- Brute force -----------------------------------------------------------------------------------------------------
+
+
+def test_nodes_are_those_of_brute_force():
+    """At random nodes of an oblique volume with noise in it, of which samples half a voxel apart know so much."""
+    one = scene(local(4.0, 0.5))
+    node = np.random.default_rng(1).integers(0, 7, (16, 3))
+    error = factors(one)[*node.T, 0] - brute_force(one, node, 4.0, 0.5)
+    assert np.sqrt(np.mean(np.square(error))) < 0.01
+
+
+@pytest.mark.slow
+def test_more_rays_and_samples_come_nearer():
+    one, node, errors = scene(), np.random.default_rng(1).integers(0, 7, (30, 3)), []
+    truth = brute_force(one, node, 4.0, 0.5)
+    for rays, samples in ((8, 4), (32, 8), (256, 32)):
+        occlusion = jvr.LocalOcclusion(rays, radius=4.0, offset=0.5, samples=samples, resolution=1.0)
+        found = factors(dataclasses.replace(one, occlusion=occlusion))[*node.T, 0]
+        errors.append(np.sqrt(np.mean(np.square(found - truth))))
+    assert errors[2] < 0.5 * errors[1] < 0.4 * errors[0]
+
+
+def test_extinction_is_gone_beyond_a_clipping_box():
+    """As in a volume that ends there."""
+    values = voxels(SHAPE)
+    box = jvr.ClippingBox((-9, -9, -9), (4, 99, 99))
+    clipped = scene(local(3.0, 0.3), volume=jvr.Volume(values), clipping=box)
+    at = np.array([[2, 3, 3], [4, 3, 3], [0, 1, 6]])
+    expected = brute_force(scene(volume=jvr.Volume(values[:5])), at, 3.0, 0.3)
+    np.testing.assert_allclose(factors(clipped)[*at.T, 0], expected, atol=0.02)
+
+
+# --- Histograms ------------------------------------------------------------------------------------------------------
+
+
+def test_histograms_are_those_of_brute_force():
+    """Hats around the scalars of each bin, averaged over the ball with weight `1 / d^2`; what a transfer function makes of them is what
+    their bins take away."""
+    one = scene(jvr.HistogramOcclusion(4, 64, radius=4.0, offset=0.5, samples=8, resolution=1.0, bleeding=0.5))
+    kept = jvr.precompute(one)
+    held: LocalHistograms = kept.occlusion.projected
+    positions = np.linspace(np.min(voxels(SHAPE)), np.max(voxels(SHAPE)), 4)
+    np.testing.assert_allclose(held.positions, positions, rtol=1e-5)
+    assert held.length == pytest.approx(3.5)
+    for node in ((2, 3, 3), (0, 5, 2)):
+        s, inside = around(one, np.array(node), 4.0, 0.5)
+        hats = np.maximum(0, 1 - np.abs(s[..., None] - positions) / (positions[1] - positions[0]))
+        np.testing.assert_allclose(held.weights[node], np.mean(hats * inside[..., None], axis=(0, 1)), atol=0.02)
+    # A new transfer function leaves them as they are.
+    rgb, sigma = np.array([0.2, 0.5, 1.0]), 0.7
+    other = dataclasses.replace(kept, transfer=jvr.LinearTransfer([0.0, 0.3, 0.6, 1.0], [rgb] * 4, [sigma] * 4))
+    assert other.occlusion.stale(other) == ()
+    left = phi1(3.5 * np.asarray(held.weights).sum(axis=-1) * -np.expm1(-2 * sigma) / 2)[..., None]
+    np.testing.assert_allclose(factors(other), left + 0.5 * (1 - left) * rgb, atol=1e-6)
+    # What is invisible takes nothing.
+    clear = dataclasses.replace(kept, transfer=jvr.LinearTransfer([0.0, 0.3, 0.6, 1.0], [rgb] * 4, [0.0] * 4))
+    np.testing.assert_array_equal(factors(clear), 1.0)
+
+
+def test_histograms_know_no_gradients():
+    one = scene(jvr.HistogramOcclusion(), transfer=jvr.GradientOpacity(linear_transfer(), 0.1, 0.5))
+    with pytest.raises(ValueError, match=r"histograms know nothing of gradients.*use jvr\.LocalOcclusion"):
+        visibility(one)
+
+
+# --- Derivatives -----------------------------------------------------------------------------------------------------
+
+ARRAYS = {
+    "sigma_t": lambda s: s.transfer.sigma_t,
+    "positions": lambda s: s.transfer.positions,
+    "voxels": lambda s: s.volume.values,
+    "radius": lambda s: s.occlusion.radius,
+    "offset": lambda s: s.occlusion.offset,
+    "grain": lambda s: getattr(s.occlusion, "grain", None),
+    "bias": lambda s: s.occlusion.bias,
+    "gamma": lambda s: s.occlusion.gamma,
+}
+
+
+def differentiable(method: str) -> jvr.Scene:
+    """A scene with what is not visible in it: entries of the table, and bricks with no other value, far from all that is."""
+    values = voxels((25, 4, 4))
+    values[5:] *= 0.2
+    transfer = jvr.LinearTransfer([0.1, 0.3, 0.6, 0.9], voxels((4, 3)), [0.0, 0.0, 0.4, 0.7])
+    numbers = {"radius": 2.7, "offset": 0.4, "samples": 3, "resolution": 0.6, "bias": 0.1, "gamma": 0.8}
+    numbers |= {"grain": 0.9} if method == "histogram" else {}
+    return scene(METHODS[method](rays=6, **numbers), volume=jvr.Volume(values), transfer=transfer, lights=and_sun())
+
+
+def compare_with_differences(loss, one: jvr.Scene) -> None:
+    """Reverse mode against central differences; of voxels and entries some."""
+    gradient = eqx.filter_jit(eqx.filter_grad(loss))(one)
+    rng, loss = np.random.default_rng(3), jax.jit(loss)
+    for name, of in ARRAYS.items():
+        if of(one) is None:
+            continue
+        array, found = np.asarray(of(one)), np.asarray(of(gradient))
+        assert np.any(found != 0), name
+        for place in rng.choice(array.size, min(array.size, 6), replace=False):
+            direction = (np.arange(array.size) == place).reshape(array.shape)
+            shifted = lambda by, of=of, array=array, direction=direction: eqx.tree_at(
+                of, one, jnp.asarray(array + by * direction)
+            )
+            # No table is below zero: there the derivative is that to one side.
+            low, high = (0.0, 1e-6) if name == "sigma_t" and array.flat[place] == 0 else (-1e-6, 1e-6)
+            expected = float(loss(shifted(high)) - loss(shifted(low))) / (high - low)
+            assert found.flat[place] == pytest.approx(expected, rel=3e-5, abs=2e-7), (name, place)
+
+
+def test_derivatives_of_nodes_are_those_of_differences(x64):
+    def loss(one):
+        at = jnp.asarray(np.random.default_rng(2).uniform(0, 3, (3, 9)))
+        points = Point(tuple(at), tuple(at), *(jnp.zeros(9, jnp.int32),) * 2)
+        (left,) = visibility(one).transmittances(points, jnp.ones(9, bool), reverse=True).ambient
+        return jnp.sum(left * at[0])
+
+    one = differentiable("local")
+    compare_with_differences(loss, eqx.tree_at(lambda s: s.volume.values, one, one.volume.values[:6]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_derivatives_of_pictures_are_those_of_differences(x64, method):
+    """Entries that nothing visible has any part in among them: what becomes visible does so in the light that reaches it."""
+    one = differentiable(method)
+    settings, camera = jvr.Settings(0.7, termination=0), perspective(one.volume, 5, 4)
+
+    def loss(one):
+        rgb = jvr.render(one, camera, settings).rgb
+        return jnp.sum(rgb * jnp.asarray(np.random.default_rng(2).random(rgb.shape)))
+
+    compare_with_differences(loss, one)
+
+
+@pytest.mark.slow
+def test_forward_mode_agrees_with_reverse_mode(x64):
+    one = differentiable("local")
+    moving, still = eqx.partition(one, eqx.is_inexact_array)
+    along = jax.tree.map(lambda x: jnp.asarray(np.random.default_rng(x.size).normal(size=x.shape)), moving)
+    camera = perspective(one.volume, 4, 4)
+
+    def loss(moving, adjoint):
+        rgb = jvr.render(eqx.combine(moving, still), camera, jvr.Settings(0.7, termination=0, adjoint=adjoint)).rgb
+        return jnp.sum(rgb * jnp.asarray(np.random.default_rng(2).random(rgb.shape)))
+
+    _, tangent = jax.jit(lambda moving: jax.jvp(lambda m: loss(m, jvr.Forward()), (moving,), (along,)))(moving)
+    gradient = jax.jit(jax.grad(lambda moving: loss(moving, jvr.Replay())))(moving)
+    expected = sum(jnp.sum(g * t) for g, t in zip(jax.tree.leaves(gradient), jax.tree.leaves(along), strict=True))
+    assert tangent == pytest.approx(float(expected), rel=1e-10)
+
+
+# --- What is kept ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["local", pytest.param("histogram", marks=pytest.mark.slow)])
+def test_what_is_computed_beforehand_is_kept(method, tmp_path):
+    """And knows what it was computed of; camera and lights may change."""
+    one, done = scene(METHODS[method](rays=6, radius=3.0, samples=3, resolution=0.6)), []
+    kept = jvr.precompute(one, cache=tmp_path, report=done.append)
+    assert (done[0].part, done[0].cached) == ("occlusion", False)
+    assert kept.occlusion.is_frozen
+    np.testing.assert_allclose(factors(kept), factors(one), atol=1e-6)
+    again = jvr.precompute(one, cache=tmp_path, report=done.append)
+    assert done[1].cached
+    assert eqx.tree_equal(again, kept)
+    assert eqx.tree_equal(jvr.precompute(kept), kept)
+    brighter = dataclasses.replace(kept, lights=and_sun())
+    assert brighter.occlusion.stale(brighter) == ()
+    other = dataclasses.replace(kept, volume=jvr.Volume(voxels(SHAPE, seed=9), OBLIQUE))
+    assert list(remarks_on(other, None)) == list(other.occlusion.stale(other)) != []
+    with pytest.raises(ValueError, match=r"call jvr.precompute\(scene\) again.*occlusion.pinned\(\)"):
+        other.current()
+    with pytest.warns(RuntimeWarning, match="occlusion was computed for another"):
+        dataclasses.replace(other, occlusion=other.occlusion.pinned()).current()
+    assert not jvr.precompute(other).occlusion.stale(other)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_pictures_are_the_same_with_what_is_kept(method):
+    """Nodes that nothing visible is near to are left out, and no picture shows it."""
+    one = dataclasses.replace(differentiable(method), volume=jvr.Volume(np.asarray(differentiable(method).volume.values)))
+    np.testing.assert_allclose(picture(jvr.precompute(one)), picture(one), atol=1e-6)
+    skips_nothing = jvr.render(one, perspective(one.volume), jvr.Settings(skipping=False)).rgb
+    np.testing.assert_allclose(jvr.render(one, perspective(one.volume)).rgb, skips_nothing, atol=1e-6)
+
+
+def test_plans_and_advice_say_what_it_is():
+    one = scene(jvr.LocalOcclusion(4, samples=2))
+    (entry,) = (part for part in jvr.plan(one).parts if part.name == "occlusion")
+    assert entry.included
+    assert "computed in each picture: jvr.precompute" in entry.reason
+    (kept,) = (part for part in jvr.plan(as_precomputed(one)).parts if part.name == "occlusion")
+    assert "computed beforehand" in kept.reason
+    drop = next(candidate for candidate in effects_of(one) if candidate.title.startswith("occlusion"))
+    assert drop.change(one, jvr.Settings())[0].occlusion is None
+    assert one.replaced(lights=()).occlusion is None
+    assert one.replaced(shading=None).occlusion is None
+    assert one.replaced(lights=and_sun()).occlusion is not None
+
+
+# --- Hard cases ------------------------------------------------------------------------------------------------------
+
+
+def test_hard_cases_are_finite_and_right():
+    """Balls without extent, and of a voxel's; opaque and empty media, one value everywhere; volumes of one voxel along an axis or all."""
+    for radius, offset in ((0.0, 0.0), (0.5, 0.5), (0.3, 0.6), (2e3, 1e3)):
+        np.testing.assert_allclose(factors(scene(local(radius, offset))), 1.0, atol=1e-6)
+    for sigma in (0.0, 1e6, 1e30):
+        found = factors(homogeneous(sigma, local(2.0, 0.1)))
+        assert np.all(found == 1.0) if sigma == 0 else np.all((found > 0) & (found < 0.95))
+        assert sigma == 0 or found[3, 3, 3] < 0.01
+    few = {"rays": 8, "radius": 2.0, "samples": 2, "resolution": 1.0}
+    for make in METHODS.values():
+        found = factors(scene(make(**few), volume=jvr.Volume(np.full((1, 4, 1), 0.5))))
+        assert np.all((found > 0) & (found <= 1))
+        assert found.min() < 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_pictures_of_hard_cases_are_finite(method):
+    make = lambda **numbers: METHODS[method](rays=8, samples=2, resolution=1.0, **numbers)
+    for parts in ({"shape": (1, 1, 1)}, {"transfer": linear_transfer(scale=0.0)}, {"transfer": linear_transfer(scale=1e30)}):
+        assert np.all(np.isfinite(picture(scene(make(radius=1e6), **parts))))
+    np.testing.assert_allclose(picture(scene(make(radius=0.0))), picture(scene()), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"lights": and_sun()[1:]}, r"add a jvr\.AmbientLight to lights="),
+        ({"shading": None}, r"set shading=jvr\.Lambert\(\) or scattering="),
+    ],
+)
+def test_what_does_not_go_together_says_what_would(parts, message):
+    with pytest.raises(ValueError, match=message):
+        scene(**({"occlusion": jvr.LocalOcclusion()} | parts))
+
+
+def test_lengths_are_by_default_those_of_voxels():
+    """16 and one of the smallest spacing."""
+    small = jvr.Volume(np.full((5, 5, 5), 0.5), affine((0.1, 0.2, 0.3)))
+    one = scene(jvr.LocalOcclusion(4, samples=4), volume=small)
+    reach = one.occlusion.projection(one, lambda graded: absorbing(one, None, graded)).reach
+    # The diagonal, beyond which there is nothing, is 1.5 long.
+    np.testing.assert_allclose(reach.ends, np.linspace(0.1, np.sqrt(0.14) * 4, 5), rtol=1e-5)
+    np.testing.assert_allclose(reach.length, 1.5, rtol=1e-5)
