@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from jvr.execution.devices import over_rays, shares
 from jvr.march.medium import Medium
 from jvr.march.secondary import SecondaryRays, channel_count, secondary_rays, take_midpoint
+from jvr.model.clipping import Line
 from jvr.model.light import AbstractDeltaLight, DirectionalLight
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
@@ -26,6 +27,8 @@ from jvr.types import Channels, Scalar, Triple, Vector
 
 Result = TypeVar("Result")
 
+# Optical depth of a sample of a sweep behind geometry.
+OPAQUE = 100.0
 # A light nearer to the bounding sphere of the volume than this fraction of its radius shines in all directions.
 NEAR = 1.01
 # Samples of a sweep that are taken at a time: enough to outweigh what it costs to start an operation and to share it between cores.
@@ -39,6 +42,11 @@ class AbstractLightSpace(eqx.Module):
     def coordinates(self, x: Triple) -> Triple:
         """`(u, v, w)` of a world position."""
 
+    @property
+    @abc.abstractmethod
+    def upstream(self) -> Scalar | float:
+        """How far light has come where its rays begin (`w = 0`)."""
+
     @abc.abstractmethod
     def ray(self, u: Scalar, v: Scalar) -> tuple[Triple, Triple, Scalar]:
         """Where the ray `(u, v)` begins (`w = 0`), its unit direction, and its length (to `w = 1`)."""
@@ -50,6 +58,10 @@ class ParallelSpace(AbstractLightSpace):
     center: Vector
     axes: Float[Array, "3 3"]
     half: Vector
+
+    @property
+    def upstream(self) -> float:
+        return math.inf
 
     def coordinates(self, x: Triple) -> Triple:
         offset = tuple(c - self.center[i] for i, c in enumerate(x))
@@ -72,6 +84,10 @@ class FanSpace(AbstractLightSpace):
     rim: Scalar
     near: Scalar
     far: Scalar
+
+    @property
+    def upstream(self) -> Scalar:
+        return self.near
 
     def coordinates(self, x: Triple) -> Triple:
         d, distance = direction_and_length(tuple(c - self.position[i] for i, c in enumerate(x)))
@@ -120,21 +136,27 @@ def light_space(light: AbstractDeltaLight, volume: Volume) -> AbstractLightSpace
 
 
 class LightRays(NamedTuple):
-    """A batch of a light's rays, which go on without an end, and their lengths from `w = 0` to `w = 1`."""
+    """A batch of a light's rays, which go on without an end, their lengths from `w = 0` to `w = 1`, and how far from `w = 0` geometry ends
+    them, `None` where none is in the scene."""
 
     rays: SecondaryRays
     length: Float[Array, "rays"]
+    ends: Float[Array, "rays"] | None = None
 
 
 def rays_through(space: AbstractLightSpace, scene: Scene, u: Float[Array, "rays"], v: Float[Array, "rays"]) -> LightRays:
     """The rays `(u, v)` of a light."""
 
-    def one(u: Scalar, v: Scalar) -> LightRays:
+    def one(u: Scalar, v: Scalar) -> tuple[LightRays, Line]:
         x, direction, length = space.ray(u, v)
         grid = scene.volume.grid_from_world(x), scene.volume.grid_from_world(direction, direction=True)
-        return LightRays(secondary_rays(scene.volume, scene.clipping, (x, direction), grid), length)
+        return LightRays(secondary_rays(scene.volume, scene.clipping, (x, direction), grid), length), (x, direction)
 
-    return jax.vmap(one)(u, v)
+    light, line = jax.vmap(one)(u, v)
+    if scene.light_blocker is None:
+        return light
+    begin = jnp.broadcast_to(-space.upstream, light.length.shape)
+    return light._replace(ends=scene.light_blocker.hit(line, 0.0, begin, None)[0])
 
 
 def depth_nodes(
@@ -181,7 +203,7 @@ def _swept(
     light = rays_through(space, scene, u, v)
     together = min(max(1, SWEPT // (u.size * samples)), layers)
     blocks = -(-layers // together)
-    rays, length = jax.tree.map(lambda x: jnp.tile(x, together * samples), light)
+    rays, length, ends = jax.tree.map(lambda x: jnp.tile(x, together * samples), light)
 
     # Checkpointed: the reverse pass computes a block of layers again rather than keep all of its voxels.
     @jax.checkpoint
@@ -189,6 +211,7 @@ def _swept(
         steps = block * together * samples + jnp.arange(together * samples, dtype=u.dtype)
         begin, end = (jnp.repeat(steps + one, u.size) / (samples * layers) * length for one in (0, 1))
         dtau = take_midpoint(medium, scene.volume, rays, begin, end, True)[0]
+        dtau = dtau if ends is None else tuple(jnp.where(end > ends, OPAQUE, d) for d in dtau)
         depths = tuple(
             t + jnp.cumsum(jnp.sum(d.reshape(together, samples, -1), axis=1), axis=0) for t, d in zip(tau, dtau, strict=True)
         )

@@ -13,6 +13,7 @@ from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Rays, Transmittances
 from jvr.model.clipping import Clipping, interval_inside
 from jvr.model.effects import AbstractShadows
+from jvr.model.geometry import AbstractGeometry
 from jvr.model.light import AbstractDeltaLight
 from jvr.model.parameters import assign, choice
 from jvr.model.parts import AbstractPart, Knob, multiples
@@ -44,7 +45,8 @@ class ShadowRays(AbstractShadows):
     def visibility(self, scene: Scene, path: LightPath) -> AbstractVisibility:
         options = MarchOptions(self.termination, distance=False)
         medium = path(scene.transfer.takes_gradient)
-        return RayVisibility(scene.clipping, scene.shadow_casters, medium, self.step * jnp.min(scene.volume.spacing), options)
+        dt = self.step * jnp.min(scene.volume.spacing)
+        return RayVisibility(scene.clipping, scene.shadow_casters, medium, dt, options, scene.light_blocker)
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
         return (multiples("step", self.step, (4, 2, 1, 1 / 2), 1 / 4),)
@@ -61,6 +63,7 @@ class RayVisibility(AbstractVisibility):
     medium: Medium
     dt: Scalar
     options: MarchOptions = eqx.field(static=True)
+    geometry: AbstractGeometry | None = None
 
     def transmittances(self, points: Point, wanted: Bool[Array, "rays"], *, reverse: bool) -> Transmittances:
         return Transmittances(tuple(() if light is None else self._one(light, points, wanted, reverse) for light in self.lights))
@@ -70,13 +73,16 @@ class RayVisibility(AbstractVisibility):
         return None
 
     def _one(self, light: AbstractDeltaLight, points: Point, wanted: Bool[Array, "rays"], reverse: bool) -> Channels:
-        rays = self._rays(light, points, wanted)
+        rays, blocked = self._rays(light, points, wanted)
         through = replay_march if reverse else march
         gathered: Marched = through(self.options, self.medium, rays, self.dt)
-        return tuple(jnp.exp(-tau) for tau in gathered.tau)
+        clear = tuple(jnp.exp(-tau) for tau in gathered.tau)
+        return clear if blocked is None else tuple(jnp.where(blocked, 0.0, T) for T in clear)
 
-    def _rays(self, light: AbstractDeltaLight, points: Point, wanted: Bool[Array, "rays"]) -> Rays:
-        """From the points to a light; without length where they are not wanted."""
+    def _rays(
+        self, light: AbstractDeltaLight, points: Point, wanted: Bool[Array, "rays"]
+    ) -> tuple[Rays, Bool[Array, "rays"] | None]:
+        """From the points to a light; without length where they are not wanted, or geometry is in the way, and where that is."""
         field = self.medium.field
         assert isinstance(field, VoxelField)
         volume = field.volume
@@ -85,6 +91,7 @@ class RayVisibility(AbstractVisibility):
         w_i, distance, _ = jax.vmap(lambda x: light.sample(x, x))(x)
         along = volume.grid_from_world(w_i, direction=True)
         length = smaller(interval_inside(volume, self.clipping, (x, w_i), (points.p, along))[1], distance)
-        reaches = wanted & (length > 0)
+        blocked = None if self.geometry is None else self.geometry.hit((x, w_i), 0.0, 0.0, None)[0] < distance
+        reaches = wanted & (length > 0) if blocked is None else wanted & (length > 0) & ~blocked
         keep = lambda v: tuple(jnp.where(reaches, c, 0.0) for c in v)
-        return Rays(keep(points.p), keep(along), jnp.where(reaches, length, 0.0))
+        return Rays(keep(points.p), keep(along), jnp.where(reaches, length, 0.0)), blocked

@@ -106,7 +106,7 @@ class DepthImage(AbstractGeometry):
             height, width = self.shape
             raise ValueError(
                 f"the depth image has {height} rows and {width} columns, the camera {camera.height} and {camera.width}: render the "
-                "geometry with this camera"
+                "geometry with this camera, and leave Settings(pixel_samples=...) at 1"
             )
 
     def hit(

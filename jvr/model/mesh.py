@@ -31,7 +31,8 @@ EDGE = 1e-6
 
 
 class Mesh(AbstractGeometry):
-    """Opaque geometry as triangles, seen from both sides in its own colours; lights do not change them.
+    """Opaque geometry as triangles, seen from both sides in its own colours; lights do not change them. It shades the medium: it ends the
+    rays of the lights of a scene with shadows, and no derivative knows how its shadows move.
 
     **Arguments:** `vertices`: `(n, 3)`, positions in the world; `faces`: `(m, 3)`, whole numbers: which three vertices a triangle has;
     `rgb`: the linear radiance of each vertex, `(n, 3)`, between which it is interpolated, or of all, `(3,)`. Differentiable in `vertices`

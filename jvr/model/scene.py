@@ -166,6 +166,11 @@ class Scene(AbstractPart):
         return functools.reduce(EnvironmentLight.__add__, self.environment_lights) if self.environment_lights else None
 
     @property
+    def light_blocker(self) -> AbstractGeometry | None:
+        """The geometry that light does not get through: `None`, too, where it is known from the eye alone."""
+        return None if self.geometry is None or self.geometry.of_one_view else self.geometry
+
+    @property
     def shadow_casters(self) -> tuple[AbstractDeltaLight | None, ...]:
         """Its lights, `None` in the place of each that nothing shades."""
         return _casters(self.lights)
