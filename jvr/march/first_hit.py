@@ -200,7 +200,8 @@ def _rule(primals: tuple[Search, Rays, Reached], tangents: tuple[Search, Rays, R
         """By how much the scalar where a ray has crossed a surface exceeds its isovalue."""
         volume, values, entry, direction = eqx.combine(moving, still)
         p = tuple(jnp.where(hits.found, e + hits.u * d, 0.0) for e, d in zip(entry, direction, strict=True))
-        return jax.vmap(volume.sample)(p) - values[hits.surface]
+        # Each run that is read is one addition to all voxels in reverse mode.
+        return jax.vmap(lambda p: volume.sample(p, in_runs=True))(p) - values[hits.surface]
 
     change = jax.jvp(excess, (moving,), (moved,))[1]
     return hits, blank._replace(u=jnp.where(hits.found, -change * _inverse_slope(search.volume, rays, hits), 0.0))
@@ -340,7 +341,7 @@ def _enclosed(search: Search, rays: Rays, found: _Brackets) -> tuple[Float[Array
         # Which side either end is on is known; rounding has no say in it.
         below = jnp.minimum(excess(crossing, bracket.front), -tiny)
         above = jnp.maximum(excess(crossing, bracket.back), tiny)
-        room = jnp.full_like(bracket.front, 2.0 ** (halvings + 1)) * least
+        room = jnp.full_like(bracket.front, 2.0 ** (halvings + 2)) * least
         return _Enclosed(bracket.front, bracket.back, below, above, room, jnp.full_like(bracket.k, 2))
 
     def alive(_: _Crossing, state: _Enclosed) -> Bool[Array, "rays"]:
@@ -373,7 +374,7 @@ def _between(state: _Enclosed, width: Float[Array, "rays"], dt: Scalar) -> Float
     """Where to look next: at the secant's crossing, moved towards the middle by a little, and by as much as bisection's pace asks for."""
     middle, secant = state.front + width / 2, _secant(state)
     towards, distance = jnp.sign(middle - secant), jnp.abs(middle - secant)
-    truncation = 0.2 * jnp.square(width) / dt
+    truncation = 0.05 * jnp.square(width) / dt
     truncated = jnp.where(truncation <= distance, secant + towards * truncation, middle)
     radius = jnp.maximum(state.room - width / 2, 0.0)
     return jnp.where(jnp.abs(truncated - middle) <= radius, truncated, middle - towards * radius)

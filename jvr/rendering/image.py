@@ -31,9 +31,10 @@ class RenderStats(eqx.Module):
 class Rendering(eqx.Module):
     """A picture, row 0 at the top.
 
-    - `rgb`: `(height, width, 3)`, linear radiance; includes `T * background` where the scene has one.
-    - `alpha`: `(height, width)`, opacity of the medium, `1 - mean(T)`.
-    - `depth`: `(height, width)`, `sum T (1 - exp(-dtau)) t / alpha`, distance from the eye along the ray; 0 where alpha is 0.
+    - `rgb`: `(height, width, 3)`, linear radiance; includes `T` times what is behind the medium, a background or geometry.
+    - `alpha`: `(height, width)`, opacity of the medium, `1 - mean(T)`; 1 where opaque geometry is behind it.
+    - `depth`: `(height, width)`, `sum T (1 - exp(-dtau)) t / alpha`, distance from the eye along the ray, geometry included; 0 where alpha
+      is 0.
     - `stats`: `RenderStats`.
     """
 

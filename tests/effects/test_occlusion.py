@@ -1,6 +1,7 @@
 """Ambient occlusion: closed forms, brute force in NumPy, derivatives, what is kept, hard cases."""
 
 import dataclasses
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -13,11 +14,13 @@ from scipy.ndimage import map_coordinates
 import jvr
 from jvr.effects.histogram_occlusion import LocalHistograms
 from jvr.effects.occlusion import ProjectedOcclusion
+from jvr.io.config import build_cameras, build_scene, read_config
 from jvr.io.precompute import as_precomputed
 from jvr.march.steps import Point
 from jvr.rendering.advise import effects_of, remarks_on
 from jvr.rendering.medium import absorbing
 
+CONFIG = Path(__file__).parents[2] / "configs" / "occlusion.toml"
 SHAPE = (7, 7, 7)
 METHODS = {"local": jvr.LocalOcclusion, "histogram": jvr.HistogramOcclusion}
 
@@ -385,6 +388,18 @@ def test_pictures_of_hard_cases_are_finite(method):
 def test_what_does_not_go_together_says_what_would(parts, message):
     with pytest.raises(ValueError, match=message):
         scene(**({"occlusion": jvr.LocalOcclusion()} | parts))
+
+
+def test_the_configuration_says_what_it_draws():
+    """At four pixels a side and a few nodes."""
+    few = ["occlusion.rays=4", "occlusion.samples=2", "occlusion.resolution=0.1", "settings.step=8"]
+    config = read_config(CONFIG, ["camera.width=4", "camera.height=4", *few])
+    one = build_scene(config)
+    (camera,) = build_cameras(config, one.volume)
+    assert isinstance(one.occlusion, jvr.LocalOcclusion)
+    plain, occluded = (jvr.render(x, camera, jvr.Settings(8.0)).rgb for x in (dataclasses.replace(one, occlusion=None), one))
+    assert np.all(occluded <= plain + 1e-6)
+    assert np.max(plain - occluded) > 0.05
 
 
 def test_lengths_are_by_default_those_of_voxels():

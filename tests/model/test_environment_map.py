@@ -64,6 +64,7 @@ def test_it_is_bilinear_between_pixels_and_wraps(x64):
     np.testing.assert_allclose(jvr.EnvironmentMap(pixels).radiance(3.0 * d[inside]), wanted, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_it_meets_its_projection_and_turns_with_it():
     found, d = jvr.EnvironmentMap(painted(polynomial, 64)), directions()
     light = found.to_harmonics(2)

@@ -91,6 +91,7 @@ def test_no_ray_gets_through_where_triangles_meet():
     np.testing.assert_allclose(t, 3 - np.linalg.norm(target, axis=1), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_square_in_fog_is_seen_through_what_is_in_front(x64):
     """As a depth image of the same distances is."""
     picture = render(fog(geometry=square(1.9)), above(), STEP)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jvr
 from jvr.march.steps import End
@@ -54,6 +55,7 @@ def test_a_background_is_behind_what_is_not_opaque(x64):
     np.testing.assert_allclose(found.alpha[0, 0], np.mean(1 - 0.75 * T), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_its_derivative_is_that_of_the_closed_form(x64):
     red = lambda sigma_t: picture(slab(sigma_t), 1.0).rgb[0, 0, 0]
     closed = SIDE / 2 * np.exp(-0.4 * SIDE / 2) * (COLOUR[0] - WALL[0])

@@ -64,6 +64,7 @@ def test_what_is_behind_is_a_background_and_what_is_in_front_hides_all(x64):
         np.testing.assert_allclose(without.depth, picture(None).depth, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_depth_in_front_of_nothing_is_that_of_the_geometry(x64):
     """Behind a volume that is empty, and beside it, where rays never enter."""
     wide, view = np.linspace(2.0, 20.0, 36).reshape(6, 6), dataclasses.replace(camera(6), height_world=jnp.asarray(8.0))

@@ -61,6 +61,7 @@ def test_geometry_is_seen_between_the_planes_alone(x64):
         np.testing.assert_allclose(render(wall, camera, STEP).rgb, render(fog(), camera, STEP).rgb, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_in_the_planes_are_those_of_the_closed_form(x64):
     red = lambda near, far: jvr.render(fog(), above("orthographic", near, far), STEP).rgb[1, 2, 0]
     by_near, by_far = jax.jit(jax.grad(red, argnums=(0, 1)))(EYE - SIDE + 0.8, EYE - SIDE + 2.1)
