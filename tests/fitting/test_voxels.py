@@ -447,14 +447,7 @@ def test_the_command_line_fits_voxels_and_draws_what_it_found(desk, capsys):
 def test_the_configuration_finds_the_embedded_volume(tmp_path, monkeypatch):
     monkeypatch.setenv("JVR_CACHE", "0")
     config = Path(__file__).parents[2] / "configs" / "voxels.toml"
-    sizes = {
-        "camera.width": 16,
-        "camera.height": 16,
-        "camera.count": 6,
-        "settings.step": 2.0,
-        "fit.max_steps": 4,
-        "fit.voxels.levels": 2,
-    }
+    sizes = {"camera.width": 16, "camera.height": 16, "camera.count": 6, "settings.step": 2.0, "fit.max_steps": 4}
     small = [word for name, value in sizes.items() for word in ("--set", f"{name}={value}")]
     assert cli.run(["fit", str(config), "-o", str(tmp_path / "out"), *small]) == 0
     found, truth = jvr.read_volume(tmp_path / "out" / "volume.mha"), demo_volume()
