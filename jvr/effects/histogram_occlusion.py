@@ -3,7 +3,6 @@
 bleeding", Computer Graphics Forum 27(2), 2008; course notes on GPU-based volume ray-casting, Eurographics 2009, section 6.2).
 """
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -115,15 +114,6 @@ class HistogramOcclusion(AbstractOcclusion):
             multiples("samples", self.samples, (1 / 2, 1), 2, least=1),
             multiples("resolution", self.resolution, (1 / 2, 1), 2, most=1.0),
         )
-
-    def turned(self, knob: str, value: Any) -> "HistogramOcclusion":
-        same = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "projected"}
-        changed = HistogramOcclusion(**(same | {knob: value}))
-        return changed if self.projected is None else changed.with_projected(self.projected)
-
-    @property
-    def is_final(self) -> bool:
-        return self.is_frozen
 
     @property
     def stale_message(self) -> str:

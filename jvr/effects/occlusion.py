@@ -3,7 +3,6 @@ occlusion in direct volume rendering", IEEE TVCG 16(4), 2010; course notes on GP
 section 6.1).
 """
 
-import dataclasses
 import math
 from typing import Any, ClassVar
 
@@ -110,15 +109,6 @@ class LocalOcclusion(AbstractOcclusion):
             multiples("samples", self.samples, (1 / 4, 1 / 2, 1), 2, least=1),
             multiples("resolution", self.resolution, (1 / 2, 1), 2, most=1.0),
         )
-
-    def turned(self, knob: str, value: Any) -> "LocalOcclusion":
-        same = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "projected"}
-        changed = LocalOcclusion(**(same | {knob: value}))
-        return changed if self.projected is None else changed.with_projected(self.projected)
-
-    @property
-    def is_final(self) -> bool:
-        return self.is_frozen
 
     @property
     def stale_message(self) -> str:

@@ -22,7 +22,7 @@ from jvr.model.effects import AbstractShading
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import is_zero
 from jvr.model.ranges import NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL
-from jvr.numerics import dot, perpendicular, power_of_cosine
+from jvr.numerics import divide_or_zero, dot, perpendicular, power_of_cosine
 from jvr.types import ArrayLike, Scalar, Triple
 
 Numbers = Float[Array, "..."]
@@ -101,7 +101,7 @@ class PhenomenologicalBSDF(AbstractShading):
 
     def pdf(self, w_o: Triple, w_i: Triple) -> Numbers:
         """Density of `sample`, per solid angle; it integrates to 1 less what of the lobes lies on the wrong side."""
-        return self.value(w_o, w_i) / self.ambient_reflectance()
+        return divide_or_zero(self.value(w_o, w_i), jnp.broadcast_to(self.ambient_reflectance(), w_i[2].shape))
 
     def sample(self, w_o: Triple, u: Triple) -> tuple[Triple, Bool[Array, "..."]]:
         """A direction for three numbers in [0, 1), and whether it is on the side of its lobe; the weight `value / pdf` is `k_d + k_s + k_t`

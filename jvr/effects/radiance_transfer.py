@@ -4,7 +4,6 @@ nodes of a coarse grid, `jvr.effects.projected_radiance_transfer` is the result,
 between nodes.
 """
 
-import dataclasses
 import math
 from typing import Any, ClassVar
 
@@ -136,11 +135,10 @@ class RadianceTransfer(AbstractRadianceTransfer):
         )
 
     def turned(self, knob: str, value: Any) -> "RadianceTransfer":
-        same = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "projected"}
+        choices = {knob: value}
         if self.chromaticity is not None and knob == "order":
-            same["chromaticity"] = min(self.chromaticity, value)
-        changed = RadianceTransfer(**(same | {knob: value}))
-        return changed if self.projected is None else changed.with_projected(self.projected)
+            choices["chromaticity"] = min(self.chromaticity, value)
+        return self.rebuilt(**choices)
 
     def coarser(self, scene: Any) -> tuple[AbstractPart, ...]:
         # The exact product first: what it costs hides the rest.

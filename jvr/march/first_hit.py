@@ -10,7 +10,7 @@ that hold none of the isovalues between their bounds are skipped. Far from all i
 
 The crossing is then enclosed ever closer, by interpolation, truncation and projection (Oliveira and Takahashi, "An enhancement of the
 bisection method average performance preserving minmax optimality", ACM TOMS 47:1, 2020): about as many samples as the secant method takes,
-and never more than one more than bisection.
+and never more than two more than bisection.
 
 Its derivative is that of the implicit function `s(x(u)) = rho`: `du = (d rho - ds at fixed u) / (grad s . d)`.
 """
@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jvr.march.occupancy import Occupancy
 from jvr.march.rules import is_there, perturbed
+from jvr.march.segments import FIRST_SKIPS
 from jvr.march.steps import Rays, segment_count
 from jvr.march.wavefront import wavefront_while
 from jvr.model.bricks import bricks_of
@@ -31,8 +32,6 @@ from jvr.model.volume import Volume
 from jvr.numerics import divide_or_zero, dot, materialise, turned
 from jvr.types import Scalar
 
-# Skips before a ray is started.
-FIRST_SKIPS = 8
 # Samples of the lattice for each of the base rate, where steps are as long as bounds on the gradient allow.
 FINER = 32
 # A ray that crosses a surface under a smaller angle than this (its sine) has the derivative of this angle.
@@ -172,12 +171,11 @@ def next_hit(search: Search, rays: Rays, reached: Reached) -> Hits:
     """
     found = _brackets(search, rays, reached)
     u, samples = _enclosed(search, rays, found)
-    surface = jnp.where(found.rises, found.side, found.side - 1)
     after = jnp.where(found.rises, found.side + 1, found.side - 1)
     there = found.there
     return Hits(
         jnp.where(there, u, 0.0),
-        jnp.where(there, surface, 0),
+        jnp.where(there, found.surface, 0),
         there,
         Reached(u, found.k, after, there),
         found.steps + jnp.where(there, samples, 0),
@@ -229,6 +227,11 @@ class _Brackets(NamedTuple):
     there: Bool[Array, "rays"]
     k: Int[Array, "rays"]
     steps: Int[Array, "rays"]
+
+    @property
+    def surface(self) -> Int[Array, "rays"]:
+        """The index of the isovalue that is crossed."""
+        return jnp.where(self.rises, self.side, self.side - 1)
 
 
 class _Far(NamedTuple):
@@ -331,9 +334,8 @@ def _enclosed(search: Search, rays: Rays, found: _Brackets) -> tuple[Float[Array
     least = search.tolerance
     halvings = jnp.maximum(jnp.ceil(jnp.log2(search.dt / (2 * least))), 0.0)
     tiny = jnp.finfo(rays.length.dtype).tiny
-    surface = jnp.where(found.rises, found.side, found.side - 1)
     sign = jnp.where(found.rises, 1.0, -1.0).astype(rays.length.dtype)
-    crossing = _Crossing(rays, search.values[jnp.clip(surface, 0, search.values.size - 1)], sign, found)
+    crossing = _Crossing(rays, search.values[jnp.clip(found.surface, 0, search.values.size - 1)], sign, found)
     excess = lambda crossing, u: crossing.sign * (search.sample(crossing.rays, u)[0] - crossing.value)
 
     def begin(crossing: _Crossing) -> _Enclosed:

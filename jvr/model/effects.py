@@ -175,6 +175,8 @@ class AbstractPrecomputable(AbstractPart):
     # What has been computed beforehand, or `None`: a module whose first leaf is an array that every picture reads, with the `cache_key` of
     # what it was made of, and whether it is `pinned`.
     projected: eqx.AbstractVar[Any]
+    # What it needs of the others, for plans.
+    needs: ClassVar[tuple[str, ...]]
 
     @property
     def is_frozen(self) -> bool:
@@ -182,9 +184,25 @@ class AbstractPrecomputable(AbstractPart):
         return self.projected is not None
 
     @property
-    @abc.abstractmethod
     def is_final(self) -> bool:
         """Whether a picture has nothing left to do but to read it."""
+        return self.is_frozen
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        made = "computed beforehand" if self.is_frozen else "computed in each picture: jvr.precompute"
+        return (PlanEntry(name, True, f"{spelling(self)}, {made}", self.needs),)
+
+    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
+        yield from self.stale(scene)
+
+    def turned(self, knob: str, value: Any) -> Any:
+        return self.rebuilt(**{knob: value})
+
+    def rebuilt(self, **choices: Any) -> Any:
+        """The same with other choices, and with what was computed beforehand."""
+        same = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "projected"}
+        changed = type(self)(**(same | choices))
+        return changed if self.projected is None else changed.with_projected(self.projected)
 
     @abc.abstractmethod
     def projection(self, scene: Any, path: Any) -> Any:
@@ -262,12 +280,7 @@ class AbstractRadianceTransfer(AbstractPrecomputable):
 
     outdated, made_for = Renamed("stale"), Renamed("cache_key")
 
-    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        made = "computed beforehand" if self.is_frozen else "computed in each picture: jvr.precompute"
-        return (PlanEntry(name, True, f"{spelling(self)}, {made}", ("environment", "light march")),)
-
-    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
-        yield from self.stale(scene)
+    needs: ClassVar[tuple[str, ...]] = ("environment", "light march")
 
     def without(self, scene: Any) -> Any:
         return scene.replaced(radiance_transfer=None)
@@ -293,12 +306,7 @@ class AbstractRadianceTransfer(AbstractPrecomputable):
 class AbstractOcclusion(AbstractPrecomputable):
     """Occlusion: how much of the ambient light the medium near a point takes away."""
 
-    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        made = "computed beforehand" if self.is_frozen else "computed in each picture: jvr.precompute"
-        return (PlanEntry(name, True, f"{spelling(self)}, {made}", ("ambient light", "short rays")),)
-
-    def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
-        yield from self.stale(scene)
+    needs: ClassVar[tuple[str, ...]] = ("ambient light", "short rays")
 
     def without(self, scene: Any) -> Any:
         return scene.replaced(occlusion=None)
