@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from scipy import ndimage
 
 import jvr
 from benchmarks import scenes
@@ -42,6 +43,12 @@ def surface_peers() -> dict[str, Any]:
     return {
         **{f"{name}_seconds": median(times, name) for name in times},
         **{f"jvr_over_{name}": ratio(times, "jvr", name) for name in times if name != "jvr"},
-        **{f"other_pixels_{name}": float(np.mean(ours != seen)) for name, seen in theirs.items()},
-        "pixels": float(np.mean(ours)),
+        "pixels": int(ours.sum()),
+        **{f"other_pixels_{name}": int(np.sum(ours != seen)) for name, seen in theirs.items()},
+        **{f"away_from_silhouettes_{name}": int(np.sum((ours != seen) & ~_silhouettes(ours))) for name, seen in theirs.items()},
     }
+
+
+def _silhouettes(seen: np.ndarray) -> np.ndarray:
+    """Pixels next to one of which the other is shown."""
+    return ndimage.binary_dilation(seen) & ~ndimage.binary_erosion(seen)
