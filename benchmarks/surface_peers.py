@@ -51,4 +51,4 @@ def surface_peers() -> dict[str, Any]:
 
 def _silhouettes(seen: np.ndarray) -> np.ndarray:
     """Pixels next to one of which the other is shown."""
-    return ndimage.binary_dilation(seen) & ~ndimage.binary_erosion(seen)
+    return np.logical_and(ndimage.binary_dilation(seen), np.logical_not(ndimage.binary_erosion(seen)))

@@ -19,17 +19,18 @@ SIZE, LEVEL, REPEATS = 256, 0.3, 9
 def surfaces() -> dict[str, Any]:
     """First hit of a 128^3 isosurface at 256^2 over an opaque medium behind the same surface, unlit and lit, as processor time: a medium
     that is opaque within a few voxels, and one that is within a step; the derivative in the isovalue and in all voxels, over the first hit
-    alone; samples a ray."""
+    alone; an environment map behind the medium; samples a ray."""
     volume = scenes.gyroid()
     camera, settings = scenes.camera(volume, SIZE), jvr.Settings(0.5)
     wall = jvr.LinearTransfer([LEVEL - 0.01, LEVEL + 0.01], np.full((2, 3), 0.7), [0.0, 20.0])
     clear = jvr.LinearTransfer([-2.0, 2.0], np.zeros((2, 3)), [0.0, 0.0])
     hit = jvr.Scene(volume, clear, surfaces=jvr.Isosurfaces([LEVEL], np.full((1, 3), 0.7)))
     medium, thin = jvr.Scene(volume, scenes.opaque()), jvr.Scene(volume, wall)
+    sky = jvr.Scene(volume, scenes.opaque(), background=jvr.EnvironmentMap(np.ones((128, 256, 3))))
     lit = {"lights": (jvr.DirectionalLight((-1.0, -0.6, -1.2)),), "shading": jvr.Lambert(0.2, 0.8)}
     draw = jax.jit(lambda scene: jvr.render(scene, camera, settings))
     functions: dict[str, Callable[[], Any]] = {
-        name: lambda scene=scene: draw(scene) for name, scene in (("medium", medium), ("thin", thin), ("hit", hit))
+        name: lambda scene=scene: draw(scene) for name, scene in (("medium", medium), ("thin", thin), ("sky", sky), ("hit", hit))
     }
     for name, scene in {"medium": medium, "hit": hit}.items():
         lighted = jvr.Scene(volume, scene.transfer, surfaces=scene.surfaces, **lit)
@@ -48,6 +49,7 @@ def surfaces() -> dict[str, Any]:
         "hit_over_medium": over("hit", "medium"),
         "hit_over_thin_medium": over("hit", "thin"),
         "lit_hit_over_medium": over("lit_hit", "lit_medium"),
+        "map_over_medium": over("sky", "medium"),
         "isovalue_gradient_adds": over("isovalue", "hit") - 1,
         "voxels_gradient_adds": over("voxels", "hit") - 1,
         "samples_a_ray": float(draw(hit).stats.samples) / SIZE**2,
