@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jvr.cli.beforehand import Beforehand
-from jvr.cli.folder import CHECKPOINT, KNOWLEDGE, RESULT
+from jvr.cli.folder import CAMERAS, CHECKPOINT, KNOWLEDGE, RESULT
 from jvr.cli.inputs import BadInput, check_inputs_stay, inputs_of, reading, refused_by_jvr, warnings_as_lines
 from jvr.cli.runtime import progress, provenance, start_jax
 from jvr.io.config import Config, build_cameras, build_settings, build_start, config_from
@@ -36,6 +36,9 @@ def rank_views(folder: Path, cameras: Path | None, count: int, output: Path) -> 
         check_inputs_stay(output, [*inputs_of(saved.config), *([] if cameras is None else [cameras])])
         settings, (_, own, scene) = build_settings(saved.config), build_start(saved.config)
         given = None if cameras is None else _given(cameras, saved.config, scene)
+        if (folder / CAMERAS).exists():
+            # Cameras that were found stand where the fit has them, not where it began.
+            own = _given(folder / CAMERAS, saved.config, scene)
         scene = fit_scene(saved.config, scene, Beforehand())
     from jvr.fitting.next_view import Knowledge, around, ranked, scene_with
     from jvr.pictures import write_image

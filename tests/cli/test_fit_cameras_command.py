@@ -73,6 +73,9 @@ def test_the_configuration_finds_its_cameras_and_renders_from_there(tmp_path, mo
     assert set(result["standard_errors"]) == {"cameras[0].world_from_camera", "cameras[1].world_from_camera"}
     assert "<h2>Cameras</h2>" in (folder / "report.html").read_text()
     assert len(tomllib.loads((folder / "cameras.toml").read_text())["camera"]) == 2
+    refused = CliRunner().invoke(app, ["next-view", str(folder)])
+    assert refused.exit_code != 0
+    assert "cameras alone, of which another view says nothing: give it unknowns of the scene" in str(refused.exception)
     picture = tmp_path / "picture.png"
     arguments = ["render", "configs/pose_recovery.toml", "--set", f"camera={folder / 'cameras.toml'}", "-o", str(picture)]
     assert CliRunner().invoke(app, arguments).exit_code == 0

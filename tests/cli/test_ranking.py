@@ -1,6 +1,7 @@
 """`jvr next-view`: the folder of a fit is enough, and what it cannot do is one line."""
 
 import json
+import shutil
 import tomllib
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 import jvr
 from jvr import cli
 from jvr.io.config import build_fit, read_config
+from jvr.io.config.cameras import write_cameras
+from jvr.io.demo import demo_volume
 from jvr.io.images import read_image
 
 FIT = """
@@ -86,6 +89,17 @@ def test_views_from_all_around_are_printed_best_first(here, capfd):
     assert len(bits) == 3
     assert bits == sorted(bits, reverse=True)
     assert "best.exr" in last
+
+
+@pytest.mark.slow
+def test_candidates_are_as_far_away_as_cameras_that_were_found(here, capfd):
+    """A fit of cameras writes where they were, which is not where it began."""
+    shutil.copytree("out", "posed")
+    found = jvr.PerspectiveCamera.look_at((0.0, -250.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0, 12, 10)
+    write_cameras(here / "posed" / "cameras.toml", [found])
+    assert cli.run(["next-view", "posed", "--count", "3", "--json"]) == 0
+    eyes = np.array([view["from"] for view in json.loads(capfd.readouterr().out)["views"]])
+    np.testing.assert_allclose(np.linalg.norm(eyes - np.asarray(demo_volume().center), axis=1), 250.0, rtol=1e-5)
 
 
 @pytest.mark.slow
