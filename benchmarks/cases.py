@@ -19,6 +19,7 @@ import numpy as np
 import jvr
 from benchmarks import scenes, yardsticks
 from benchmarks.light import light
+from benchmarks.mirrors import mirrors
 from benchmarks.poses import pose_step
 from benchmarks.preparation import preparation
 from benchmarks.surface_peers import surface_peers
@@ -256,6 +257,7 @@ CASES = {
     "resident": resident,
     "preparation": preparation,
     "light": light,
+    "mirrors": mirrors,
     "surfaces": surfaces,
     "surface_peers": surface_peers,
     "fitting": fitting,

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from jvr.effects.shadow_rays import ShadowRays as ShadowRays
     from jvr.effects.shadow_volume import OpacityShadowMap as OpacityShadowMap
     from jvr.effects.shadow_volume import ShadowVolume as ShadowVolume
+    from jvr.effects.specular import Specular as Specular
     from jvr.execution.devices import use_all_cores as use_all_cores
     from jvr.fitting.bijectors import Bounded as Bounded
     from jvr.fitting.bijectors import Identity as Identity

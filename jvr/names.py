@@ -32,6 +32,7 @@ NAMES = {
     "jvr.effects.phenomenological": ("PhenomenologicalBSDF",),
     "jvr.effects.radiance_transfer": ("MaterialBleeding", "RadianceTransfer", "TransferBleeding"),
     "jvr.effects.scattering": ("SingleScattering",),
+    "jvr.effects.specular": ("Specular",),
     "jvr.effects.shading": ("BlinnPhong", "Lambert", "Phong"),
     "jvr.effects.shadow_map": ("ShadowMap",),
     "jvr.effects.shadow_rays": ("ShadowRays",),

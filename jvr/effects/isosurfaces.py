@@ -4,13 +4,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jvr.effects.lighting import LitShader
-from jvr.march.first_hit import FINER, Hits, Reached, Search, next_hit, start, steepest_of
+from jvr.march.first_hit import FINER, Hits, Reached, Search, leaving, next_hit, start, steepest_of
 from jvr.march.medium import Medium
 from jvr.march.occupancy import occupancy_of_values
-from jvr.march.steps import Rays, points_at
+from jvr.march.steps import Point, Rays, points_at
 from jvr.model.bricks import Bricks
 from jvr.model.effects import AbstractSurfaces
 from jvr.model.parameters import assign, choice, parameter
@@ -114,6 +114,9 @@ class Isosurfaces(AbstractSurfaces):
     def next_hit(self, prepared: Search, rays: Rays, reached: Reached) -> Hits:
         return next_hit(prepared, rays, reached)
 
+    def leaving(self, prepared: Search, rays: Rays, hits: Hits, crosses: Bool[Array, "rays"]) -> Reached:
+        return leaving(prepared, rays, hits, crosses)
+
     def shown(self, medium: Medium, rays: Rays, hits: Hits) -> tuple[Triple, Float[Array, "rays"]]:
         own = lambda column: jnp.where(hits.found, column[hits.surface], 0.0)
         colour = tuple(own(self.rgb[:, c]) for c in range(3))
@@ -124,6 +127,14 @@ class Isosurfaces(AbstractSurfaces):
         return colour, opacity
 
 
+def hit_points(rays: Rays, hits: Hits) -> Point:
+    """Where rays hit; one that does not has a point at rest, for what is computed there to be finite."""
+    there = lambda x: jnp.where(hits.found, x, 0.0)
+    still = Rays(tuple(map(there, rays.entry)), tuple(map(there, rays.direction)), rays.length)
+    zero = jnp.zeros_like(hits.surface)
+    return points_at(still, jnp.arange(zero.size, dtype=jnp.int32), zero, hits.u)
+
+
 def _lit(shader: LitShader, medium: Medium, rays: Rays, hits: Hits, colour: Triple) -> Triple:
     """What surfaces of a colour reflect."""
     # A surface does not scatter as a medium does, and where it is cut there is none of it.
@@ -131,9 +142,7 @@ def _lit(shader: LitShader, medium: Medium, rays: Rays, hits: Hits, colour: Trip
         shader.optical, shader.frame, shader.world_from_grid, shader.lights, shader.shading, None, None, shader.environment
     )
     there = lambda x: jnp.where(hits.found, x, 0.0)
-    still = Rays(tuple(map(there, rays.entry)), tuple(map(there, rays.direction)), rays.length)
-    zero = jnp.zeros_like(hits.surface)
-    point = points_at(still, jnp.arange(zero.size, dtype=jnp.int32), zero, hits.u)
+    point = hit_points(rays, hits)
     sample = jax.vmap(medium.field.resample)(point)
     if medium.visibility is not None:
         sample = sample._replace(light=medium.visibility.transmittances(point, hits.found, reverse=True))

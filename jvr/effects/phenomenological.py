@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from jvr.effects.shading import surface_weight
 from jvr.model.by_value import ByValue
+from jvr.model.dielectric import mirrored, refracted
 from jvr.model.effects import AbstractShading
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import is_zero
@@ -140,18 +141,11 @@ class _Sides(NamedTuple):
 
 def _sides(normal: Triple, w_o: Triple, index: Scalar | None, inside: Bool[Array, "..."] | bool) -> _Sides:
     """`normal` is turned to the eye; `inside`: whether that is in the medium of the larger values."""
-    cosine = dot(normal, w_o)
-    mirrored = tuple(2 * cosine * n - o for n, o in zip(normal, w_o, strict=True))
-    straight = tuple(-o for o in w_o)
+    mirror = mirrored(normal, w_o)
     if index is None:
-        return _Sides(normal, mirrored, straight, jnp.zeros_like(cosine, bool))
-    eta = jnp.where(inside, index, 1 / index)
-    square = 1 - jnp.square(eta) * (1 - cosine) * (1 + cosine)
-    total = square < 0
-    # The root has no derivative at the angle of total reflection; where there is none, none is taken.
-    onward = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    bent = tuple(eta * (cosine * n - o) - onward * n for n, o in zip(normal, w_o, strict=True))
-    return _Sides(normal, mirrored, tuple(jnp.where(total, a, b) for a, b in zip(straight, bent, strict=True)), total)
+        return _Sides(normal, mirror, tuple(-o for o in w_o), jnp.zeros_like(mirror[0], bool))
+    behind = refracted(normal, w_o, jnp.where(inside, index, 1 / index))
+    return _Sides(normal, mirror, behind.direction, behind.total)
 
 
 def _up(like: Triple) -> Triple:

@@ -19,6 +19,7 @@ from jvr.model.effects import (
     AbstractScattering,
     AbstractShading,
     AbstractShadows,
+    AbstractSpecular,
     AbstractSurfaces,
 )
 from jvr.model.environment import EnvironmentLight
@@ -63,6 +64,7 @@ KINDS: dict[type, dict[str, str]] = {
         "deep-map": "DeepShadowMap",
     },
     AbstractSurfaces: {"isosurfaces": "Isosurfaces"},
+    AbstractSpecular: {"specular": "Specular"},
     AbstractScattering: {"single": "SingleScattering"},
     AbstractPhase: {
         "isotropic": "Isotropic",

@@ -38,6 +38,8 @@ FINER = 32
 LEAST_SINE = 1e-3
 # The fraction of rays that may idle while others are searched, and while crossings are enclosed: both take few steps.
 IDLE_SEARCH, IDLE_ENCLOSED = 0.5, 0.8
+# How many tolerances from a surface that it leaves a ray looks for the next one.
+SETS_OFF = 4.0
 # The side of a point where there are no data.
 MISSING = -1
 
@@ -159,6 +161,15 @@ def start(search: Search, rays: Rays) -> Reached:
         k = jax.lax.fori_loop(0, FIRST_SKIPS, lambda _, k: jnp.minimum(k + search.skip(rays, k), segments), k)
     u = jnp.minimum(k * search.dt, rays.length)
     return jax.lax.stop_gradient(Reached(u, k, search.sample(rays, u)[1], k < segments))
+
+
+def leaving(search: Search, rays: Rays, hits: Hits, crosses: Bool[Array, "rays"]) -> Reached:
+    """The beginning of rays that start where others have hit a surface, on the side behind it where they cross it. Sides are known, so that
+    a ray does not meet the surface that it leaves; one that it meets at once is met no nearer than a few tolerances."""
+    before = 2 * hits.surface + 1 - hits.reached.side
+    near = jnp.minimum(SETS_OFF * search.tolerance, rays.length)
+    side = jnp.where(crosses, hits.reached.side, before)
+    return jax.lax.stop_gradient(Reached(near, jnp.zeros_like(side), side, hits.found))
 
 
 @jax.custom_jvp

@@ -119,9 +119,38 @@ class AbstractSurfaces(AbstractPart):
         """Where rays meet one next, as `jvr.march.first_hit.Hits`; differentiable."""
 
     @abc.abstractmethod
+    def leaving(self, prepared: Any, rays: Any, hits: Any, crosses: Any) -> Any:
+        """The beginning of rays that start at `hits` of others: on the side that these came from, or where a ray `crosses`, on that
+        behind."""
+
+    @abc.abstractmethod
     def shown(self, medium: Any, rays: Any, hits: Any) -> tuple[Triple, Float[Array, "rays"]]:
         """Radiance towards the eye of what rays meet in a medium, under the light that reaches it, and how opaque it is; 0 where they meet
         nothing."""
+
+
+class AbstractSpecular(AbstractPart):
+    """How surfaces send rays on: mirrored, straight, or bent."""
+
+    # How many times in a row a ray is sent on.
+    order: eqx.AbstractVar[int]
+
+    @property
+    @abc.abstractmethod
+    def bends(self) -> bool:
+        """Whether what passes a surface changes its direction."""
+
+    def without(self, scene: Any) -> Any:
+        return scene.replaced(specular=None)
+
+    @abc.abstractmethod
+    def check(self, surfaces: Any) -> None:
+        """**Raises** `ValueError` for surfaces that it does not go with."""
+
+    @abc.abstractmethod
+    def deflected(self, volume: Any, medium: Any, rays: Any, hits: Any) -> tuple[Float[Array, "rays"], Triple, Triple]:
+        """Of rays that hit a surface in a medium, the fraction of what they bring that is mirrored, 0 where they do not, and where they
+        look to in the world: mirrored, and behind the surface."""
 
 
 class AbstractShadows(AbstractPart):

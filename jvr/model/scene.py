@@ -16,6 +16,7 @@ from jvr.model.effects import (
     AbstractScattering,
     AbstractShading,
     AbstractShadows,
+    AbstractSpecular,
     AbstractSurfaces,
 )
 from jvr.model.environment import EnvironmentLight
@@ -61,10 +62,11 @@ class Scene(AbstractPart):
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
       `jvr.ForwardDifferences()`, `jvr.CentralDifferences()`, `jvr.SobelDifferences()`, `jvr.PrecomputedGradient()`.
     - `surfaces`: `jvr.Isosurfaces(...)`, shaded as the medium is, or `None`.
+    - `specular`: how surfaces mirror and bend rays, `jvr.Specular(...)`, or `None`: not at all.
 
     **Raises** `ValueError` for shadows without a light, or with nothing that shows light; for occlusion without ambient light, or with
     nothing that shows it; for one of environment and material without the other, and for radiance transfer without both; for surfaces
-    between nearest voxels, or whose normals are those of the opacity.
+    between nearest voxels, or whose normals are those of the opacity; for a specular part without surfaces, or with a depth image.
     """
 
     volume: Volume = parameter(doc="a jvr.Volume, as jvr.read_volume gives it")
@@ -86,6 +88,7 @@ class Scene(AbstractPart):
     occlusion: AbstractOcclusion | None = parameter(doc="one of jvr's")
     geometry: AbstractGeometry | None = parameter(doc="a jvr.DepthImage or a jvr.Mesh")
     surfaces: AbstractSurfaces | None = parameter(doc="jvr.Isosurfaces(...)")
+    specular: AbstractSpecular | None = parameter(doc="jvr.Specular(...)")
 
     def __init__(
         self,
@@ -106,16 +109,18 @@ class Scene(AbstractPart):
         geometry: AbstractGeometry | None = None,
         occlusion: AbstractOcclusion | None = None,
         surfaces: AbstractSurfaces | None = None,
+        specular: AbstractSpecular | None = None,
     ):
         # None of several is no clipping.
         clipping = clipping if isinstance(clipping, AbstractClipping) or clipping else None
         assign(self, volume=volume, transfer=transfer, background=background, optical=optical, clipping=clipping)
         assign(self, lights=lights, shading=shading, shadows=shadows, scattering=scattering, normals=normals)
         assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer, geometry=geometry)
-        assign(self, surfaces=surfaces, occlusion=occlusion)
+        assign(self, surfaces=surfaces, specular=specular, occlusion=occlusion)
         _check_light(self)
         _check_environment(self)
         _check_surfaces(self)
+        _check_specular(self)
 
     def current(self) -> "Scene":
         """The same scene with nothing in it that was computed for another: `Volume.current()`, and each precomputed part `checked`. What
@@ -188,7 +193,8 @@ class Scene(AbstractPart):
 
     def replaced(self, **parts: Any) -> "Scene":
         """The scene with other parts, and without what these cannot carry: shadows go with the last light that casts them and the last part
-        that shows them, occlusion with the last ambient light or that part, material and radiance transfer with the environment."""
+        that shows them, occlusion with the last ambient light or that part, material and radiance transfer with the environment, what is
+        specular with the surfaces."""
         light, shading, scattering = (parts.get(name, getattr(self, name)) for name in ("lights", "shading", "scattering"))
         if not any(_casters(light)) or (shading is None and scattering is None):
             parts["shadows"] = None
@@ -196,6 +202,8 @@ class Scene(AbstractPart):
             parts["occlusion"] = None
         if not _environments(light, parts.get("environment", self.environment)):
             parts |= {"material": None, "radiance_transfer": None}
+        if parts.get("surfaces", self.surfaces) is None:
+            parts["specular"] = None
         return dataclasses.replace(self, **parts)
 
     @property
@@ -261,3 +269,14 @@ def _check_surfaces(scene: Scene) -> None:
         raise ValueError("nearest voxels have no isosurfaces between them: set jvr.Volume(interpolation=jvr.Trilinear())")
     if scene.normals.of_opacity and scene.needs_gradient:
         raise ValueError("isosurfaces are lit by the gradient of the scalar: set normals=...(of_opacity=False)")
+
+
+def _check_specular(scene: Scene) -> None:
+    """What mirrors and bends rays, and what these may meet."""
+    if scene.specular is None:
+        return
+    if scene.surfaces is None:
+        raise ValueError("there is no surface to be specular: set surfaces=jvr.Isosurfaces(...), or leave specular out")
+    if scene.geometry is not None and scene.geometry.of_one_view:
+        raise ValueError("mirrored rays do not know a depth image, which is of the eye's alone: give geometry=jvr.Mesh(...)")
+    scene.specular.check(scene.surfaces)

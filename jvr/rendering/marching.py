@@ -9,6 +9,7 @@ from jvr.march.steps import Rays
 from jvr.model.scene import Scene
 from jvr.rendering.integrator import AbstractRayIntegrator, Radiance
 from jvr.rendering.medium import Prepared, medium
+from jvr.rendering.specular import seen_in_mirrors
 from jvr.rendering.surfaces import blended_with_surfaces, ended_at_surfaces
 from jvr.rendering.trace import composite, seen_end
 
@@ -29,6 +30,8 @@ class Uniform(AbstractRayIntegrator):
         if surfaces is None:
             gathered = settings.adjoint.march(options, through, rays.without_end, prepared.dt)
             return radiance_of(prepared.scene, gathered, rays)
+        if prepared.scene.specular is not None and prepared.scene.specular.order:
+            return seen_in_mirrors(prepared, through, rays)
         if not surfaces.is_opaque:
             return blended_with_surfaces(prepared, through, rays)
         rays, steps = ended_at_surfaces(prepared, through, rays)

@@ -30,18 +30,22 @@ def ended_at_surfaces(prepared: Prepared, medium: Medium, rays: Rays) -> tuple[R
     return rays._replace(length=jnp.where(hits.found, hits.u, rays.length), end=end), hits.steps
 
 
-class _Seen(NamedTuple):
+class Seen(NamedTuple):
     """What a ray has brought up to the distance `u`: radiance, and for each channel of optical depth transmittance, opacity and
-    opacity-weighted distance; `on`: whether it goes on."""
+    opacity-weighted distance; `steps`: samples that took."""
 
     radiance: Channels
     clear: Channels
     opacity: Channels
     distance: Channels
     u: Float[Array, "rays"]
-    on: Bool[Array, "rays"]
-    reached: Any
     steps: Int[Array, "rays"]
+
+
+def nothing_seen(rays: Rays, n: int) -> Seen:
+    """The beginning, with `n` channels of optical depth."""
+    zero = jnp.zeros_like(rays.length)
+    return Seen((zero,) * 3, (zero + 1,) * n, (zero,) * n, (zero,) * n, zero, jnp.zeros_like(rays.length, jnp.int32))
 
 
 def blended_with_surfaces(prepared: Prepared, medium: Medium, rays: Rays) -> Radiance:
@@ -49,55 +53,54 @@ def blended_with_surfaces(prepared: Prepared, medium: Medium, rays: Rays) -> Rad
     settings, surfaces = prepared.settings, prepared.scene.surfaces
     assert surfaces is not None
     way, options = rays.without_end, MarchOptions(settings.termination, distance=True)
-    zero = jnp.zeros_like(rays.length)
     n = max(channel_counts(medium, way, prepared.dt)[1], 1)
     # Not alive, but not to be lost either: a ray that is no number is marched, and brings none.
-    none, start = jnp.zeros_like(rays.length, jnp.int32), surfaces.start(prepared.search, way)
-    seen = _Seen((zero,) * 3, (zero + 1,) * n, (zero,) * n, (zero,) * n, zero, none == 0, start, none)
+    start = surfaces.start(prepared.search, way)
 
-    def stretch(seen: _Seen, index: Int[Array, ""]) -> tuple[_Seen, None]:
-        on = seen.on & (index < surfaces.most) & seen.reached.on
-        hits = surfaces.next_hit(prepared.search, way, seen.reached._replace(on=on))
+    def stretch(state: tuple[Seen, Bool[Array, "rays"], Any], index: Int[Array, ""]) -> tuple[Any, None]:
+        seen, on, reached = state
+        hits = surfaces.next_hit(prepared.search, way, reached._replace(on=on & (index < surfaces.most) & reached.on))
         end = jnp.where(hits.found, hits.u, way.length)
         entry = tuple(e + seen.u * d for e, d in zip(way.entry, way.direction, strict=True))
-        part = Rays(entry, way.direction, jnp.where(seen.on, end - seen.u, 0.0))
+        part = Rays(entry, way.direction, jnp.where(on, end - seen.u, 0.0))
         gathered = settings.adjoint.march(options, medium, part, prepared.dt)
-        passed = _behind_stretch(seen, gathered)
+        passed = behind_stretch(seen, gathered)
         rgb, opacity = surfaces.shown(medium, way, hits)
-        passed = _behind_layer(passed, rgb, opacity, hits.u)
+        passed = behind_layer(passed, rgb, opacity, hits.u)
         # Where nothing absorbs and no surface is opaque a ray goes on for ever.
         bright = jnp.max(jnp.stack(passed.clear), axis=0) > settings.termination
-        on = seen.on & hits.found & bright
+        on = on & hits.found & bright
         assert gathered.steps is not None
         steps = passed.steps + hits.steps + gathered.steps
-        return passed._replace(u=jnp.where(on, hits.u, passed.u), on=on, reached=hits.reached, steps=steps), None
+        return (passed._replace(u=jnp.where(on, hits.u, passed.u), steps=steps), on, hits.reached), None
 
-    seen, _ = jax.lax.scan(stretch, seen, jnp.arange(surfaces.most + 1, dtype=jnp.int32))
+    beginning = (nothing_seen(rays, n), start.k == start.k, start)
+    (seen, _, _), _ = jax.lax.scan(stretch, beginning, jnp.arange(surfaces.most + 1, dtype=jnp.int32))
     return _resolved(prepared, rays, seen)
 
 
-def _spread(channels: Channels, n: int) -> Channels:
+def spread(channels: Channels, n: int) -> Channels:
     """One channel or three as `n`."""
     return channels * (n // len(channels))
 
 
-def _behind_stretch(seen: _Seen, gathered: Marched) -> _Seen:
+def behind_stretch(seen: Seen, gathered: Marched) -> Seen:
     """What has been seen behind a stretch of the medium that begins at `seen.u`."""
     tau = gathered.tau or (jnp.zeros_like(seen.u),)
     distance = gathered.distance or (jnp.zeros_like(seen.u),)
     opaque = tuple(map(one_minus_exp, tau))
     radiance = seen.radiance
     if gathered.radiance:
-        radiance = tuple(L + T * c for L, T, c in zip(radiance, _spread(seen.clear, 3), gathered.radiance, strict=True))
+        radiance = tuple(L + T * c for L, T, c in zip(radiance, spread(seen.clear, 3), gathered.radiance, strict=True))
     opacity = tuple(a + T * o for a, T, o in zip(seen.opacity, seen.clear, opaque, strict=True))
     along = (T * (x + seen.u * o) for T, x, o in zip(seen.clear, distance, opaque, strict=True))
     clear = tuple(T * jnp.exp(-x) for T, x in zip(seen.clear, tau, strict=True))
     return seen._replace(radiance=radiance, clear=clear, opacity=opacity, distance=tuple(map(jnp.add, seen.distance, along)))
 
 
-def _behind_layer(seen: _Seen, rgb: Channels, opacity: Float[Array, "rays"], u: Float[Array, "rays"]) -> _Seen:
+def behind_layer(seen: Seen, rgb: Channels, opacity: Float[Array, "rays"], u: Float[Array, "rays"]) -> Seen:
     """What has been seen behind a layer of a colour and an opacity."""
-    light = (opacity * T * c for T, c in zip(_spread(seen.clear, 3), rgb, strict=True))
+    light = (opacity * T * c for T, c in zip(spread(seen.clear, 3), rgb, strict=True))
     return seen._replace(
         radiance=tuple(map(jnp.add, seen.radiance, light)),
         clear=tuple(T * (1 - opacity) for T in seen.clear),
@@ -106,15 +109,13 @@ def _behind_layer(seen: _Seen, rgb: Channels, opacity: Float[Array, "rays"], u: 
     )
 
 
-def _resolved(prepared: Prepared, rays: Rays, seen: _Seen) -> Radiance:
+def _resolved(prepared: Prepared, rays: Rays, seen: Seen) -> Radiance:
     """The radiance of rays with what is behind all of it."""
     far, zero = behind(prepared.scene, rays), jnp.zeros_like(rays.length)
     if far is not None:
-        seen = seen._replace(
-            radiance=tuple(L + T * b for L, T, b in zip(seen.radiance, _spread(seen.clear, 3), far, strict=True))
-        )
+        seen = seen._replace(radiance=tuple(L + T * b for L, T, b in zip(seen.radiance, spread(seen.clear, 3), far, strict=True)))
     if rays.end is not None:
-        seen = _behind_layer(seen, (zero,) * 3, rays.end.opaque, rays.end.distance)
+        seen = behind_layer(seen, (zero,) * 3, rays.end.opaque, rays.end.distance)
     mean = lambda channels: sum(channels[1:], channels[0]) / len(channels)
     poison = jnp.where(jnp.isnan(rays.length), jnp.nan, 0.0)
     rgb = jnp.stack(seen.radiance, axis=-1) + poison[:, None]

@@ -177,6 +177,9 @@ SCENES = {
     "natural": lambda: natural(radiance_transfer=jvr.RadianceTransfer(exact=True)),
     "occluded": lambda: lit(lights=[jvr.AmbientLight()], occlusion=jvr.LocalOcclusion(8, radius=2, samples=3, bias=0.1)),
     "histograms": histograms,
+    "glass": lambda: scene(
+        surfaces=jvr.Isosurfaces((0.4, 0.6), voxels((2, 3)), (0.3, 1.0)), specular=jvr.Specular([0.2, 0.7], 1.4, order=1)
+    ),
     "isosurfaces": lambda: lit(surfaces=jvr.Isosurfaces((0.4, 0.6), voxels((2, 3)), (0.3, 1.0), band=0.2, step=0.5, most=2)),
     "negative": lambda: natural(environment=jvr.EnvironmentLight(-0.0 * np.ones((4, 3)), clamped=False)),
     "seen": lambda: natural(environment=(sky := jvr.EnvironmentMap(voxels((4, 8, 3)), order=2)), background=sky),

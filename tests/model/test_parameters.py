@@ -215,6 +215,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "HeadLight": {},
     "HenyeyGreenstein": {"g": 0.3},
     "HistogramOcclusion": {"radius": 3.0, "offset": 0.5, "gamma": 2.0, "grain": 1.0, "bleeding": 0.5},
+    "Specular": {"reflectance": 0.5, "index": 1.5},
     "Isosurfaces": {"values": [0.0, 1.0], "rgb": RGB, "opacity": [0.5, 0.5], "band": 0.1},
     "JendersieEon": {"diameter": 10.0},
     "Lambert": {},
@@ -289,6 +290,7 @@ PLACES = {
     "AbstractPhase": "scattering.phase",
     "AbstractNormals": "normals",
     "AbstractSurfaces": "surfaces",
+    "AbstractSpecular": "specular",
     "AbstractBRDF": "material",
     "AbstractTransfer": "transfer",
     "AbstractRadianceTransfer": "radiance_transfer",
@@ -403,6 +405,7 @@ def data_with(place: str, table: dict[str, Any]) -> dict[str, Any]:
         "transfer": {"kind": "window"},
         "lights": [{"kind": "directional", "direction": [0, 0, 1]}, {"kind": "ambient"}],
         "shading": {"kind": "lambert"},
+        "surfaces": {"values": [0.5], "rgb": [[1, 1, 1]]},
         "environment": "constant",
         "material": "lambert",
     }

@@ -72,6 +72,17 @@ def increasing(value: list[float]) -> list[float]:
     return value
 
 
+def number_or_each(what: str, within: Interval = ANY) -> BeforeValidator:
+    """One number, or a list of them."""
+
+    def check(value: Any) -> float | list[float]:
+        if not isinstance(value, list):
+            return _number(value, what, within)
+        return [_number(v, what, within, f"entry {i} ") for i, v in enumerate(value)]
+
+    return BeforeValidator(check)
+
+
 def number_or_triple(what: str, within: Interval = ANY) -> BeforeValidator:
     """One number, or three for red, green and blue."""
 

@@ -1,4 +1,4 @@
-"""From tables to lights, shading, shadows, occlusion, scattering, normals and surfaces. What is not named is not imported."""
+"""From tables to lights, shading, shadows, occlusion, scattering, normals, surfaces and mirrors. What is not named is not imported."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ def light_parts(config: Config, transfer: AbstractTransfer) -> dict[str, Any]:
     tables, parts = config.tables, {}
     if tables.lights:
         parts["lights"] = _lights(config, tables.lights, "lights")
-    for name in ("shading", "shadows", "scattering", "normals", "surfaces", "occlusion"):
+    for name in ("shading", "shadows", "scattering", "normals", "surfaces", "specular", "occlusion"):
         if getattr(tables, name) is not None:
             parts[name] = made(config.where, name, getattr(tables, name))
     if transfer.takes_gradient and "normals" in parts and parts["normals"].of_opacity:
@@ -47,7 +47,7 @@ def _lights(config: Config, tables: list[Any], key: str) -> tuple[AbstractLight,
 
 def graded(volume: Volume, parts: dict[str, Any], transfer: AbstractTransfer) -> Volume:
     """The volume with gradients at its voxels, where precomputed ones are asked for."""
-    normals, others = parts.get("normals"), [parts[name] for name in ("scattering", "material") if name in parts]
+    normals, others = parts.get("normals"), [parts[name] for name in ("scattering", "material", "specular") if name in parts]
     asked = "shading" in parts or transfer.takes_gradient or any(part.needs_gradient for part in others)
     if not asked or not isinstance(normals, PrecomputedGradient) or normals.of_opacity:
         return volume

@@ -1,4 +1,4 @@
-"""Tables of everything about light: lights, shading, shadows, occlusion, scattering, normals, surfaces.
+"""Tables of everything about light: lights, shading, shadows, occlusion, scattering, normals, surfaces, mirrors.
 
 Most are those of classes (`jvr.io.config.schema.parts`); here is what says something else.
 """
@@ -13,7 +13,14 @@ from jvr.io.config.errors import shown
 from jvr.io.config.schema.parts import WRITTEN, KindTable, part
 from jvr.io.config.schema.table import Length, Position, one_or_more
 from jvr.io.kinds import KINDS
-from jvr.model.effects import AbstractOcclusion, AbstractScattering, AbstractShading, AbstractShadows, AbstractSurfaces
+from jvr.model.effects import (
+    AbstractOcclusion,
+    AbstractScattering,
+    AbstractShading,
+    AbstractShadows,
+    AbstractSpecular,
+    AbstractSurfaces,
+)
 from jvr.model.light import AbstractLight
 from jvr.model.normals import AbstractNormals
 from jvr.model.phase import AbstractPhase
@@ -109,3 +116,4 @@ Occlusion = Annotated[Any, part(AbstractOcclusion, "local")]
 Scattering = Annotated[Any, part(AbstractScattering, "single")]
 Normals = Annotated[Any, part(AbstractNormals, "analytic")]
 Surfaces = Annotated[Any, part(AbstractSurfaces, "isosurfaces")]
+Specular = Annotated[Any, part(AbstractSpecular, "specular")]

@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import Discriminator, PlainValidator, Tag, ValidationError, create_model, model_validator
 
-from jvr.io.config.checks import number, number_or_triple, numbers, numbers_or_triples, problem, whole
+from jvr.io.config.checks import number, number_or_each, number_or_triple, numbers, numbers_or_triples, problem, whole
 from jvr.io.config.errors import first_complaint, shown, unknown_choice
 from jvr.io.config.schema.table import Colour, Table, named
 from jvr.io.kinds import KINDS, maker_of
@@ -182,6 +182,8 @@ def _numbers(shapes: tuple[Shape, ...], what: str, within: Any) -> Any:
             return Annotated[float, number(what, within)]
         case ((), (3,)):
             return Annotated[Any, number_or_triple(what, within)]
+        case ((), (str(),)):
+            return Annotated[Any, number_or_each(what, within)]
         case ((int(count),),):
             return Annotated[list[float], numbers(count, what, within)]
         case ((str(),),):

@@ -16,6 +16,7 @@ from jvr.io.config.schema.light import (
     Scattering,
     Shading,
     Shadows,
+    Specular,
     Surfaces,
     casts_shadows,
 )
@@ -267,6 +268,7 @@ class ConfigTable(Table):
     scattering: Scattering | None = None
     normals: Normals | None = None
     surfaces: Surfaces | None = None
+    specular: Specular | None = None
     environment: Environments = Field(default=[])
     material: Material | None = None
     radiance_transfer: RadianceTransfer | None = None
@@ -287,6 +289,8 @@ class ConfigTable(Table):
             raise problem('it is that of ambient light; add [[lights]] with kind = "ambient"', "occlusion")
         if self.occlusion is not None and self.shading is None and self.scattering is None:
             raise problem("nothing shows it; add [shading] or [scattering]", "occlusion")
+        if self.specular is not None and self.surfaces is None:
+            raise problem("there is no surface to be specular; add [surfaces]", "specular")
         if self.environment and self.material is None:
             raise problem('nothing shows it; add [material], such as kind = "lambert"', "environment")
         if self.material is not None and not self.environment:
