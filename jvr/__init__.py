@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from jvr.effects.isosurfaces import Isosurfaces as Isosurfaces
     from jvr.effects.occlusion import LocalOcclusion as LocalOcclusion
     from jvr.effects.phenomenological import PhenomenologicalBSDF as PhenomenologicalBSDF
+    from jvr.effects.piecewise_shadows import PiecewiseShadows as PiecewiseShadows
     from jvr.effects.radiance_transfer import MaterialBleeding as MaterialBleeding
     from jvr.effects.radiance_transfer import RadianceTransfer as RadianceTransfer
     from jvr.effects.radiance_transfer import TransferBleeding as TransferBleeding

@@ -30,6 +30,7 @@ NAMES = {
     "jvr.effects.occlusion": ("LocalOcclusion",),
     "jvr.effects.isosurfaces": ("Isosurfaces",),
     "jvr.effects.phenomenological": ("PhenomenologicalBSDF",),
+    "jvr.effects.piecewise_shadows": ("PiecewiseShadows",),
     "jvr.effects.radiance_transfer": ("MaterialBleeding", "RadianceTransfer", "TransferBleeding"),
     "jvr.effects.scattering": ("SingleScattering",),
     "jvr.effects.shading": ("BlinnPhong", "Lambert", "Phong"),

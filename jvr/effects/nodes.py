@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jvr.execution.devices import over_rays, shares
 from jvr.execution.tiles import dealt, joined
 from jvr.march.medium import Medium
+from jvr.march.rules import perturbed
 from jvr.model.grids import Shape, node_positions
 from jvr.model.volume import Volume
 
@@ -84,3 +85,24 @@ def project_all(projection: AbstractProjection, active: Bool[Array, "nodes"]) ->
     order = dealt(len(chunks), shares())
     found = joined(over_rays(share, projection, (chunks[order], busy[order])), len(chunks), shares())
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(p)], found)
+
+
+@jax.custom_jvp
+def visible_nodes(projection: AbstractProjection) -> tuple[Array, ...]:
+    """What the active nodes of a scene hold. Where it is differentiated all of them do: what is not visible may become so, and has a
+    derivative in the light that reaches it."""
+    return projection.all_nodes()
+
+
+def _visible_nodes_rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    tangents = perturbed(primals, tangents)
+    moving, still = eqx.partition(primals, jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None))
+
+    def whole(moving: Any) -> tuple[Array, ...]:
+        (projection,) = eqx.combine(moving, still)
+        return project_all(projection, jnp.ones(math.prod(projection.shape), bool))
+
+    return jax.jvp(whole, (moving,), (tangents,))
+
+
+visible_nodes.defjvp(_visible_nodes_rule, symbolic_zeros=True)

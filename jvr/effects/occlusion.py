@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, UInt32
 
 from jvr.effects.grid import Grid
-from jvr.effects.nodes import AbstractProjection, project_all
+from jvr.effects.nodes import AbstractProjection, visible_nodes
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
-from jvr.march.rules import perturbed
 from jvr.march.secondary import SecondaryRays, channel_count, secondary_rays, take_midpoint
 from jvr.march.steps import Point, Transmittances
 from jvr.model.clipping import Clipping
@@ -134,7 +133,7 @@ class LocalOcclusion(AbstractOcclusion):
 
     def visibility(self, scene: Scene, path: LightPath) -> "OcclusionVisibility":
         kept = self.projected
-        taken = self._taken(scene.volume, *_all_nodes(self.projection(scene, path))) if kept is None else kept.taken
+        taken = self._taken(scene.volume, *visible_nodes(self.projection(scene, path))) if kept is None else kept.taken
         return occlusion_visibility(self, scene.volume, taken)
 
     def _taken(self, volume: Volume, nodes: Float[Array, "nodes channels"]) -> Float[Array, "x y z channels"]:
@@ -262,24 +261,3 @@ def fractions_inside(rays: SecondaryRays, begin: Scalar, end: Scalar) -> tuple[F
     enters, leaves = clamp(rays.t_in, begin, end), clamp(rays.t_out, begin, end)
     length = jnp.broadcast_to(end - begin, enters.shape)
     return divide_or_zero(enters - begin, length), divide_or_zero(larger(leaves - enters, 0.0), length)
-
-
-@jax.custom_jvp
-def _all_nodes(projection: OcclusionProjection) -> tuple[Array, ...]:
-    """What the active nodes of a scene hold. Where it is differentiated all of them do: what is not visible may become so, and has a
-    derivative in the light that reaches it."""
-    return projection.all_nodes()
-
-
-def _all_nodes_rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    tangents = perturbed(primals, tangents)
-    moving, still = eqx.partition(primals, jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None))
-
-    def whole(moving: Any) -> tuple[Array, ...]:
-        (projection,) = eqx.combine(moving, still)
-        return project_all(projection, jnp.ones(math.prod(projection.shape), bool))
-
-    return jax.jvp(whole, (moving,), (tangents,))
-
-
-_all_nodes.defjvp(_all_nodes_rule, symbolic_zeros=True)

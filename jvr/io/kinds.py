@@ -61,6 +61,7 @@ KINDS: dict[type, dict[str, str]] = {
         "map": "ShadowMap",
         "opacity-map": "OpacityShadowMap",
         "deep-map": "DeepShadowMap",
+        "piecewise": "PiecewiseShadows",
     },
     AbstractSurfaces: {"isosurfaces": "Isosurfaces"},
     AbstractScattering: {"single": "SingleScattering"},

@@ -241,6 +241,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "PhenomenologicalBSDF": {},
     "Phong": {},
     "PhongBRDF": {},
+    "PiecewiseShadows": {},
     "PointLight": {"position": [0.0, 0.0, 1.0], "attenuation": [1.0, 0.5, 0.5]},
     "PrecomputedGradient": {},
     "RadianceTransfer": {"chromaticity": 1, "bleeding": jvr.TransferBleeding()},
