@@ -106,7 +106,6 @@ def test_the_error_falls_with_the_square_of_the_distance_between_nodes(make, x64
     errors = [error(4, n / 6) for n in (1, 2, 4)]
     order = -np.polyfit(np.log([1, 2, 4]), np.log(errors), 1)[0]
     assert order > 1.5, (errors, order)
-    assert errors[2] < 2e-3
     assert error(99, 1 / 6) < 0.05 * errors[0]
 
 
@@ -169,8 +168,8 @@ def test_hard_cases_are_finite_and_right():
             total = lambda one: sum(jnp.sum(light[0]) for light in lights_at(one, points(np.array([[4.0, 4, 4], *at]))))
             assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(jax.grad(total, allow_int=True)(one)) if g.dtype == float)
     for shape in ((1, 1, 1), (1, 9, 1)):
-        thin = scene(jvr.PiecewiseShadows(2, 0.25), jvr.Volume(np.ones(shape)), solid(1.0), (sun(),))
-        np.testing.assert_array_equal(found(thin, np.zeros((1, 3))), 1.0)
+        thin = [scene(s, jvr.Volume(np.ones(shape)), solid(1.0), (sun(),)) for s in (jvr.PiecewiseShadows(2), jvr.ShadowRays())]
+        np.testing.assert_allclose(*(found(one, np.zeros((1, 3))) for one in thin), rtol=1e-6)
     # The clipped part is opaque.
     values = np.where(np.arange(9) > 5, 1.0, 0.2) * np.ones((9, 9, 9))
     box = jvr.ClippingBox((-1, -1, -1), (9, 9, 5))
