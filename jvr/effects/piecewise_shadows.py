@@ -140,15 +140,14 @@ class BeyondProjection(AbstractProjection):
         """At grid positions. Where nothing is left, that where the way ends, its limit."""
         origin = tuple(c.astype(self.reach.dtype) for c in p.T)
         ways = ways_to(light, self.volume, self.clipping, origin)
-        # A node may be where the volume is cut away; what is beyond the cut is of no use to it, and of use to its neighbours.
-        first = larger(ways.begin, 0.0)
-        hit = ways.end > first
+        # From a node where the volume is cut away the line to the light may leave what is left of it behind the node, or miss it.
+        hit = ways.end > ways.begin
         end = jnp.where(hit, ways.end, 0.0)
-        begin = smaller(larger(jnp.where(hit, first, 0.0), self.reach), end)
+        begin = smaller(larger(jnp.where(hit, larger(ways.begin, 0.0), 0.0), self.reach), end)
         fractions = (jnp.arange(self.samples, dtype=end.dtype) + 0.5) / self.samples
         u = (begin + fractions[:, None] * (end - begin)).ravel()
         along = tuple(jnp.tile(d, self.samples) for d in ways.along)
         there = (jnp.tile(c, self.samples) + u * d for c, d in zip(origin, along, strict=True))
         there = tuple(rounded_into(c, first, last) for c, first, last in zip(there, *self.volume.domain, strict=True))
         classified, _ = classify_at(self.medium, points_of(there, along), jnp.ones_like(u, bool))
-        return tuple(jnp.mean(sigma.reshape(self.samples, -1), axis=0) for sigma in classified.sigma_t)
+        return tuple(jnp.where(hit, jnp.mean(s.reshape(self.samples, -1), axis=0), 0.0) for s in classified.sigma_t)
