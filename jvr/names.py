@@ -27,6 +27,7 @@ class Renamed:
 NAMES = {
     "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
     "jvr.effects.histogram_occlusion": ("HistogramOcclusion", "LocalHistograms"),
+    "jvr.effects.in_scattering": ("InScattering",),
     "jvr.effects.occlusion": ("LocalOcclusion",),
     "jvr.effects.isosurfaces": ("Isosurfaces",),
     "jvr.effects.phenomenological": ("PhenomenologicalBSDF",),

@@ -17,15 +17,14 @@ from jvr.march.rules import perturbed
 from jvr.model.grids import Shape, node_positions
 from jvr.model.volume import Volume
 
-# Nodes that are computed together.
-CHUNK = 256
-
 
 class AbstractProjection(eqx.Module):
     """All that is needed to compute what the nodes of a scene hold. `medium`: what rays pass that are sent out from them."""
 
     volume: eqx.AbstractVar[Volume]
     medium: eqx.AbstractVar[Medium]
+    # Nodes that are computed together.
+    chunk: ClassVar[int] = 256
     # How many nodes away a visible point may be that makes a node worth it.
     reach_of_nodes: ClassVar[int] = 1
 
@@ -45,8 +44,8 @@ class AbstractProjection(eqx.Module):
 
     def nodes(self, index: Int[Array, "nodes"]) -> tuple[Array, ...]:
         """What some nodes hold, a chunk at a time."""
-        fill = -index.shape[0] % CHUNK
-        chunks = jnp.pad(jnp.asarray(self.positions)[index], ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3)
+        fill = -index.shape[0] % self.chunk
+        chunks = jnp.pad(jnp.asarray(self.positions)[index], ((0, fill), (0, 0)), mode="edge").reshape(-1, self.chunk, 3)
         found = jax.lax.map(lambda p: self.project(p), chunks)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: index.shape[0]], found)
 
@@ -67,10 +66,10 @@ class AbstractProjection(eqx.Module):
 
 def project_all(projection: AbstractProjection, active: Bool[Array, "nodes"]) -> tuple[Array, ...]:
     """What all nodes hold, zero where they are not `active`; chunks without an active node are left out. Traceable."""
-    p = projection.positions
-    fill = -len(p) % CHUNK
-    chunks = jnp.asarray(np.pad(p, ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3))
-    busy = jnp.pad(active, (0, fill)).reshape(-1, CHUNK)
+    p, chunk_size = projection.positions, projection.chunk
+    fill = -len(p) % chunk_size
+    chunks = jnp.asarray(np.pad(p, ((0, fill), (0, 0)), mode="edge").reshape(-1, chunk_size, 3))
+    busy = jnp.pad(active, (0, fill)).reshape(-1, chunk_size)
     # Not the bound method: JAX hashes what it is to call, and Equinox all that a method is bound to.
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda p: projection.project(p), chunks[0]))
 

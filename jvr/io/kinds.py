@@ -62,6 +62,7 @@ KINDS: dict[type, dict[str, str]] = {
         "opacity-map": "OpacityShadowMap",
         "deep-map": "DeepShadowMap",
         "piecewise": "PiecewiseShadows",
+        "in-scattering": "InScattering",
     },
     AbstractSurfaces: {"isosurfaces": "Isosurfaces"},
     AbstractScattering: {"single": "SingleScattering"},

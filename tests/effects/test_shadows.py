@@ -315,9 +315,7 @@ def along_each(p, moves, shadows, h=1e-6):
     return (np.asarray(above) - np.asarray(below)) / (2 * h)
 
 
-@pytest.mark.parametrize(
-    "method", ["none", *(pytest.param(m, marks=pytest.mark.slow) for m in SHADOWS if m != "none")]
-)
+@pytest.mark.parametrize("method", ["none", *(pytest.param(m, marks=pytest.mark.slow) for m in SHADOWS if m != "none")])
 def test_replay_against_central_differences(method, x64):
     """Along a random direction in each kind of array: transfer function, voxels, lights, pose, camera, phase function, albedo."""
     p, shadows = parameters(), SHADOWS[method]

@@ -215,6 +215,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "HeadLight": {},
     "HenyeyGreenstein": {"g": 0.3},
     "HistogramOcclusion": {"radius": 3.0, "offset": 0.5, "gamma": 2.0, "grain": 1.0, "bleeding": 0.5},
+    "InScattering": {"radius": 3.0, "offset": 0.5},
     "Isosurfaces": {"values": [0.0, 1.0], "rgb": RGB, "opacity": [0.5, 0.5], "band": 0.1},
     "JendersieEon": {"diameter": 10.0},
     "Lambert": {},
