@@ -225,7 +225,7 @@ class InScatteringProjection(AbstractProjection):
                 n = len(found) // projection.lights
                 return [found[i : i + n] for i in range(0, len(found), n)]
 
-            means = mean_light(projection.medium, volume, reach, rays, lights)
+            means = mean_light(projection.medium, volume, reach, rays, lights=lights)
             return 1 - jnp.stack([jnp.mean(mean.reshape(p.shape[0], -1), axis=1) for mean in means], axis=-1)
 
         return (taken(self, p),)

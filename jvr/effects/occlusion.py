@@ -49,6 +49,11 @@ class LocalOcclusion(AbstractOcclusion):
     is 1 where nothing is near and `bias^gamma` where everything is opaque (equation 6.4 has `(bias + I)^gamma`, which exceeds 1).
     Coloured extinction has an `I` for each channel. Where the volume or its clipping box ends there is nothing more.
 
+    With a `glow` the medium lights what is near it by its emission (emissive tissue, equation 6.5): the integrand of each colour is
+    multiplied with `1 + c_E(s)`, `c_E` being `glow` times the emission that the transfer function names, and `I` may exceed 1. It is the
+    radiance that arrives where `glow = (R - a) / L` under ambient radiance `L`, of which it is a multiple: without ambient light nothing
+    glows.
+
     `I` is found at the nodes of a grid near which something is visible, by cubic convolution at the voxels, and is trilinear in between.
     Along a ray extinction is constant in each of `samples` segments, whose integral is exact: what is homogeneous has no error of the
     quadrature.
@@ -61,11 +66,12 @@ class LocalOcclusion(AbstractOcclusion):
     - `samples`: segments along each ray.
     - `resolution`: nodes for each voxel along an axis, above 0 and at most 1.
     - `bias`: 0 ... 1; `gamma`: positive, or `None` for 1.
+    - `glow`: not negative, or `None` where nothing does.
 
-    Differentiable in transfer function, voxels, `radius`, `offset`, `bias` and `gamma` while it is not computed beforehand; then each
-    picture does it anew. `jvr.precompute(scene)` does it once and keeps `I`, which is then a constant: `bias`, `gamma`, camera and lights
-    may change, what it was made of may not, unless it is `pinned()`. Costs `rays x samples` samples for each node. **Raises** `ValueError`
-    for numbers outside their ranges.
+    Differentiable in transfer function, voxels, `radius`, `offset`, `bias`, `gamma` and `glow` while it is not computed beforehand; then
+    each picture does it anew. `jvr.precompute(scene)` does it once and keeps `I`, which is then a constant: `bias`, `gamma`, camera and
+    lights may change, what it was made of may not, unless it is `pinned()`. Costs `rays x samples` samples for each node. **Raises**
+    `ValueError` for numbers outside their ranges, and for a `glow` without emission.
     """
 
     rays: int = choice(AT_LEAST_ONE, doc="rays for each node")
@@ -75,6 +81,9 @@ class LocalOcclusion(AbstractOcclusion):
     resolution: float = choice(Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start")
     bias: Scalar = parameter(UNIT_INTERVAL, doc="share of ambient light that nothing takes away")
     gamma: Scalar | None = parameter(POSITIVE, doc="exponent of what is left of ambient light")
+    glow: Scalar | None = parameter(
+        NOT_NEGATIVE, doc="light of its own that the medium sends to what is near", unit="mm / radiance"
+    )
     projected: ProjectedOcclusion | None = parameter(doc="what has been computed beforehand")
 
     def __init__(
@@ -87,8 +96,10 @@ class LocalOcclusion(AbstractOcclusion):
         resolution: float | int = 0.5,
         bias: ArrayLike = 0.0,
         gamma: ArrayLike | None = None,
+        glow: ArrayLike | None = None,
     ):
         assign(self, rays=rays, radius=radius, offset=offset, samples=samples, resolution=resolution, bias=bias, gamma=gamma)
+        assign(self, glow=glow)
         self.projected = None
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
@@ -103,10 +114,10 @@ class LocalOcclusion(AbstractOcclusion):
 
     @property
     def stale_message(self) -> str:
-        return stale_message("occlusion", "occlusion", "transfer function, volume, clipping box, radius or offset")
+        return stale_message("occlusion", "occlusion", "transfer function, volume, clipping box, radius, offset or glow")
 
     def sources(self, scene: Scene) -> Any:
-        return *sources_of_rays(scene), self.radius, self.offset
+        return *sources_of_rays(scene), self.radius, self.offset, self.glow
 
     def projection(self, scene: Scene, path: LightPath) -> "OcclusionProjection":
         return OcclusionProjection(
@@ -114,6 +125,7 @@ class LocalOcclusion(AbstractOcclusion):
             clipping=scene.clipping,
             medium=path(scene.transfer.takes_gradient),
             reach=Reach.of(self, scene.volume),
+            glow=self.glow,
             rays=self.rays,
             resolution=self.resolution,
         )
@@ -128,7 +140,7 @@ class LocalOcclusion(AbstractOcclusion):
 
     def _taken(self, volume: Volume, nodes: Float[Array, "nodes channels"]) -> Float[Array, "x y z channels"]:
         """What all nodes take of ambient light, on the grid of the voxels."""
-        return fractions_at_voxels(volume, nodes, self.resolution)
+        return fractions_at_voxels(volume, nodes, self.resolution, least=0.0 if self.glow is None else -jnp.inf)
 
 
 class OcclusionVisibility(AbstractVisibility):
@@ -165,6 +177,7 @@ class OcclusionProjection(AbstractProjection):
     clipping: Clipping
     medium: Medium
     reach: Reach
+    glow: Scalar | None
     rays: int = eqx.field(static=True)
     resolution: float = eqx.field(static=True)
 
@@ -179,7 +192,7 @@ class OcclusionProjection(AbstractProjection):
         @jax.checkpoint
         def taken(projection: "OcclusionProjection", p: Float[Array, "nodes 3"]) -> Float[Array, "nodes channels"]:
             rays = short_rays(projection.volume, projection.clipping, projection.rays, p)
-            means = mean_light(projection.medium, projection.volume, projection.reach, rays)
+            means = mean_light(projection.medium, projection.volume, projection.reach, rays, glow=projection.glow)
             return 1 - jnp.stack([jnp.mean(mean.reshape(p.shape[0], -1), axis=1) for mean in means], axis=-1)
 
         return (taken(self, p),)

@@ -14,6 +14,7 @@ from jvr.march.medium import Medium
 from jvr.march.secondary import SecondaryRays, channel_count, secondary_rays, take_midpoint
 from jvr.model.clipping import Clipping
 from jvr.model.scene import Scene
+from jvr.model.transfer import Classified
 from jvr.model.volume import Volume
 from jvr.numerics import clamp, divide_or_zero, larger, mean_transmittance, smaller
 from jvr.types import Channels, Scalar, Triple
@@ -63,10 +64,17 @@ def _sphere(rays: int) -> Float[np.ndarray, "rays 3"]:
 
 
 def mean_light(
-    medium: Medium, volume: Volume, reach: Reach, rays: SecondaryRays, lights: Callable[[Triple], list[Channels]] | None = None
+    medium: Medium,
+    volume: Volume,
+    reach: Reach,
+    rays: SecondaryRays,
+    *,
+    lights: Callable[[Triple], list[Channels]] | None = None,
+    glow: Scalar | None = None,
 ) -> Channels:
     """The mean over the length of each ray of the light that comes to its start: of the transmittance, times what each of the `lights` has
-    at grid positions of the volume, where these are given; all channels of the first, then of the next."""
+    at grid positions of the volume, where these are given; all channels of the first, then of the next. With a `glow` there is more light
+    where the medium emits some, `1 + glow` times its emission."""
 
     def lit(seen: Channels, at: Scalar) -> Channels:
         if lights is None:
@@ -78,22 +86,32 @@ def mean_light(
     def step(state: tuple[Channels, Channels], ends: tuple[Scalar, Scalar]) -> tuple[tuple[Channels, Channels], None]:
         tau, total = state
         begin, end = ends
-        dtau, _, _ = take_midpoint(medium, volume, rays, begin, end, True)
+        dtau, classified, _ = take_midpoint(medium, volume, rays, begin, end, True)
         before, inside = fractions_inside(rays, begin, end)
         behind = 1 - before - inside
+        # Light of the medium's own is attenuated like that from behind it.
+        lit_inside = (inside,) * len(tau) if glow is None else tuple(inside * (1 + glow * c) for c in _own_light(classified))
+        dtau = dtau * (len(tau) // len(dtau))
         seen = tuple(
-            jnp.exp(-t) * (before + inside * mean_transmittance(d) + behind * jnp.exp(-d)) for t, d in zip(tau, dtau, strict=True)
+            jnp.exp(-t) * (before + own * mean_transmittance(d) + behind * jnp.exp(-d))
+            for t, d, own in zip(tau, dtau, lit_inside, strict=True)
         )
         total = tuple(a + b for a, b in zip(total, lit(seen, 0.5 * (begin + end)), strict=True))
         return (tuple(t + d for t, d in zip(tau, dtau, strict=True)), total), None
 
-    zero = (jnp.zeros_like(rays.t_out),) * channel_count(medium, volume, rays)
+    zero = (jnp.zeros_like(rays.t_out),) * (channel_count(medium, volume, rays) if glow is None else 3)
     count = len(jax.eval_shape(lambda: lit(zero, reach.length)))
     start = (zero, zero[:1] * count)
     (tau, total), _ = jax.lax.scan(jax.checkpoint(step), start, (reach.ends[:-1], reach.ends[1:]))
     segments = reach.ends.shape[0] - 1
     far = lit(tuple(jnp.exp(-t) for t in tau), reach.ends[-1])
     return tuple((1 - reach.beyond) * c / segments + reach.beyond * t for c, t in zip(total, far, strict=True))
+
+
+def _own_light(classified: Classified) -> Channels:
+    if not classified.emission:
+        raise ValueError("nothing glows: give the transfer function emission=..., or leave glow out")
+    return classified.emission
 
 
 def fractions_inside(rays: SecondaryRays, begin: Scalar, end: Scalar) -> tuple[Float[Array, "rays"], Float[Array, "rays"]]:
