@@ -221,7 +221,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "Lambert": {},
     "LambertBRDF": {},
     "LinearTransfer": {"positions": [0.0, 1.0], "rgb": RGB, "sigma_t": [0.1, 0.2], "emission": RGB},
-    "LocalOcclusion": {"radius": 3.0, "offset": 0.5, "gamma": 2.0},
+    "LocalOcclusion": {"radius": 3.0, "offset": 0.5, "gamma": 2.0, "glow": 1.0},
     "LutTransfer": {"rgb": RGB, "sigma_t": [0.1, 0.2], "domain": [0.0, 1.0], "emission": RGB},
     "Mesh": {"vertices": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], "faces": [[0, 1, 2]], "rgb": [0.1, 0.2, 0.3]},
     "MaterialByValue": {"positions": [0.0, 1.0], "materials": [jvr.LambertBRDF(), jvr.LambertBRDF()]},
