@@ -52,12 +52,12 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
     `bias + (1 - bias) I`, its least being `bias`.
 
     `T` is found at the nodes of a grid and is trilinear in between, outside of the volume that on its border; `I` at the same nodes where
-    something is visible near by, by cubic convolution at the voxels, trilinear in between. In a ball without extent it is `T`.
+    something is visible near by, by cubic convolution at the voxels, trilinear in between. Where `R` and `a` are 0 it is `T`.
 
     **Arguments:**
 
     - `rays`, `radius`, `offset`, `samples`, `resolution`: `K`, `R`, `a`, segments along each ray and nodes for each voxel, as of
-      `jvr.LocalOcclusion`; lengths in the world, by default 16 and 1 times the smallest spacing. An offset is at most the radius.
+      `jvr.LocalOcclusion`; lengths in the world, by default 16 and 1 times the smallest spacing.
     - `bias`: 0 ... 1.
     - `direct`: how light gets to where it is scattered: `jvr.PiecewiseShadows()`, or another way of shadows.
 

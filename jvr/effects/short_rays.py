@@ -16,7 +16,7 @@ from jvr.model.clipping import Clipping
 from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
 from jvr.model.volume import Volume
-from jvr.numerics import clamp, divide_or_zero, larger, mean_transmittance, smaller
+from jvr.numerics import clamp, divide_or_zero, larger, mean_transmittance
 from jvr.types import Channels, Scalar, Triple
 
 # Radius and offset where a scene says none, in voxels of the smallest spacing.
@@ -36,13 +36,13 @@ class Reach(eqx.Module):
 
     @classmethod
     def of(cls, part: Any, volume: Volume) -> "Reach":
-        """How far those of a part with `radius`, `offset` and `samples` go. No larger than the offset, a radius leaves them no length."""
+        """How far those of a part with `radius`, `offset` and `samples` go."""
         spacing = jnp.min(volume.spacing)
         offset = OFFSET * spacing if part.offset is None else part.offset
         radius = RADIUS * spacing if part.radius is None else part.radius
         length = larger(radius - offset, 0.0)
         inside = clamp(2 * volume.radius - offset, jnp.zeros_like(length), length)
-        ends = smaller(offset, radius) + inside * jnp.linspace(0.0, 1.0, part.samples + 1, dtype=spacing.dtype)
+        ends = offset + inside * jnp.linspace(0.0, 1.0, part.samples + 1, dtype=spacing.dtype)
         return cls(ends, length, divide_or_zero(length - inside, length))
 
 
