@@ -32,6 +32,9 @@ def methods(quick: bool, opaque: bool) -> dict[str, list[tuple[str, Any]]]:
     found = {
         "rays: step": [(f"{step:g}", jvr.ShadowRays(step)) for step in (8, 4, 2, 1)],
         "volume: resolution": [(f"1/{n:g}", jvr.ShadowVolume(1 / n)) for n in (12, 6, 3, 1.5)],
+        "piecewise: piece, resolution": [
+            (f"{h}, 1/{n}", jvr.PiecewiseShadows(h, 1 / n)) for h, n in ((2, 8), (4, 4), (8, 4), (8, 2))
+        ],
         "opacity map: texels, layers": [
             (f"{n}, {k}", jvr.OpacityShadowMap(n, k)) for n, k in ((32, 8), (64, 16), (128, 32), (256, 64))
         ],

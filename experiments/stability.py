@@ -188,7 +188,7 @@ def rows(quick: bool = False) -> dict[str, list[Case]]:
         ],
     } | placed_rows(quick)
     if not quick:
-        for shadows in (jvr.ShadowVolume(1.0), jvr.OpacityShadowMap(9, 7), jvr.DeepShadowMap(9, 7)):
+        for shadows in (jvr.ShadowVolume(1.0), jvr.OpacityShadowMap(9, 7), jvr.DeepShadowMap(9, 7), jvr.PiecewiseShadows(1, 0.5)):
             cases = [base(sigma=f, shadows=shadows, label=f"depth {f:g}") for f in (0.0, 1.0, 1e4, 1e8)]
             cases += [base(**unit, lights=point(*p), shadows=shadows, label=str(p)) for p in ((2, 2.5, 3), (2.2, 2.7, 3.4))]
             found[f"{type(shadows).__name__}: optical depth 0 ... 1e8, light inside"] = cases

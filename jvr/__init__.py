@@ -9,9 +9,11 @@ if TYPE_CHECKING:
     from jvr.effects.deep_shadow_map import DeepShadowMap as DeepShadowMap
     from jvr.effects.histogram_occlusion import HistogramOcclusion as HistogramOcclusion
     from jvr.effects.histogram_occlusion import LocalHistograms as LocalHistograms
+    from jvr.effects.in_scattering import InScattering as InScattering
     from jvr.effects.isosurfaces import Isosurfaces as Isosurfaces
     from jvr.effects.occlusion import LocalOcclusion as LocalOcclusion
     from jvr.effects.phenomenological import PhenomenologicalBSDF as PhenomenologicalBSDF
+    from jvr.effects.piecewise_shadows import PiecewiseShadows as PiecewiseShadows
     from jvr.effects.radiance_transfer import MaterialBleeding as MaterialBleeding
     from jvr.effects.radiance_transfer import RadianceTransfer as RadianceTransfer
     from jvr.effects.radiance_transfer import TransferBleeding as TransferBleeding

@@ -27,9 +27,11 @@ class Renamed:
 NAMES = {
     "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
     "jvr.effects.histogram_occlusion": ("HistogramOcclusion", "LocalHistograms"),
+    "jvr.effects.in_scattering": ("InScattering",),
     "jvr.effects.occlusion": ("LocalOcclusion",),
     "jvr.effects.isosurfaces": ("Isosurfaces",),
     "jvr.effects.phenomenological": ("PhenomenologicalBSDF",),
+    "jvr.effects.piecewise_shadows": ("PiecewiseShadows",),
     "jvr.effects.radiance_transfer": ("MaterialBleeding", "RadianceTransfer", "TransferBleeding"),
     "jvr.effects.scattering": ("SingleScattering",),
     "jvr.effects.specular": ("Specular",),

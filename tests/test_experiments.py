@@ -15,6 +15,7 @@ from experiments import (
     occlusion_accuracy,
     other_renderers,
     phase_recovery,
+    piecewise_shadows,
     pose_recovery,
     relight,
     shadowed_fit,
@@ -165,6 +166,16 @@ def test_the_accuracy_of_occlusion_runs(monkeypatch, tmp_path):
         assert max(local["rmse_seen"], local["rmse_matter"]) < 0.5 * min(subject["without"].values())
         # More directions are nearer to all of them.
         assert rows["local", "rays 8"]["rmse_matter"] > local["rmse_matter"]
+
+
+@pytest.mark.slow
+def test_the_table_of_piecewise_shadows_runs(monkeypatch, tmp_path):
+    result, size = ran(piecewise_shadows, monkeypatch, tmp_path)
+    assert size > 10_000
+    (subject,) = result["subjects"].values()
+    rows = {(row["piece"], row["resolution"]): row["rmse"] for row in subject["rows"]}
+    # An exact piece is better than none, and that than no shadows.
+    assert rows[4, 0.5] < rows[0, 0.5] < subject["without"]["rmse"]
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ class Beforehand:
         from jvr.io.precompute import precompute
 
         note = lambda part: self.report.append(part._asdict())
-        with bar("environment lighting" if scene.environment_light is not None else "occlusion") as show:
+        with bar("environment lighting" if scene.environment_light is not None else "light") as show:
             return precompute(scene, cache=cache_folder("precomputed"), progress=show, report=note, **keywords)
 
 

@@ -1,6 +1,7 @@
 """Values at the nodes of a regular grid, trilinear in between."""
 
 import itertools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,6 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from jvr.numerics import clamp, materialise
 from jvr.types import Channels, Triple
+
+Rows = Float[Array, "points channels"]
 
 
 class Grid(eqx.Module):
@@ -23,8 +26,9 @@ class Grid(eqx.Module):
         nx, ny, nz, channels = nodes.shape
         return cls(nodes.reshape(-1, channels), (nx - 1, ny - 1, nz - 1))
 
-    def interpolate(self, at: Triple, wanted: Bool[Array, "points"]) -> Channels:
-        """At a batch of positions in units of cells; beyond the border as on it. What is not `wanted` may be anything finite."""
+    def interpolate(self, at: Triple, wanted: Bool[Array, "points"], of: Callable[[Rows], Rows] = lambda rows: rows) -> Channels:
+        """At a batch of positions in units of cells; beyond the border as on it. `of`: what is interpolated of the channels of nodes, one
+        around each of the points. What is not `wanted` may be anything finite."""
         ny, nz = (n + 1 for n in self.cells[1:])
         # Each step once, else positions are computed anew for each fraction, and all of it for each number that is read.
         at = materialise(wanted, tuple(clamp(c, 0, n) for c, n in zip(at, self.cells, strict=True)))
@@ -35,6 +39,6 @@ class Grid(eqx.Module):
         for a, b, c in itertools.product(*[range(min(n, 1) + 1) for n in self.cells]):
             row = self.rows.at[first + (a * ny + b) * nz + c].get(mode="promise_in_bounds")
             weight = (x if a else 1 - x) * (y if b else 1 - y) * (z if c else 1 - z)
-            total += weight[:, None] * row
+            total += weight[:, None] * of(row)
         total = materialise(wanted, total)
         return tuple(total[:, i] for i in range(total.shape[1]))

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt32
 
 from jvr.effects.nodes import AbstractProjection
-from jvr.effects.occlusion import OcclusionVisibility, Reach, fractions_inside, occlusion_visibility, short_rays
+from jvr.effects.occlusion import OcclusionVisibility, occlusion_visibility
+from jvr.effects.short_rays import Reach, fractions_inside, short_rays
 from jvr.march.medium import DENSEST, LightPath, Medium
 from jvr.march.secondary import take_midpoint
 from jvr.model.clipping import Clipping

@@ -13,11 +13,9 @@ from jaxtyping import Array, Bool, Float, Int
 from jvr.execution.devices import over_rays, shares
 from jvr.execution.tiles import dealt, joined
 from jvr.march.medium import Medium
+from jvr.march.rules import perturbed
 from jvr.model.grids import Shape, node_positions
 from jvr.model.volume import Volume
-
-# Nodes that are computed together.
-CHUNK = 256
 
 
 class AbstractProjection(eqx.Module):
@@ -25,6 +23,8 @@ class AbstractProjection(eqx.Module):
 
     volume: eqx.AbstractVar[Volume]
     medium: eqx.AbstractVar[Medium]
+    # Nodes that are computed together.
+    chunk: ClassVar[int] = 256
     # How many nodes away a visible point may be that makes a node worth it.
     reach_of_nodes: ClassVar[int] = 1
 
@@ -44,8 +44,8 @@ class AbstractProjection(eqx.Module):
 
     def nodes(self, index: Int[Array, "nodes"]) -> tuple[Array, ...]:
         """What some nodes hold, a chunk at a time."""
-        fill = -index.shape[0] % CHUNK
-        chunks = jnp.pad(jnp.asarray(self.positions)[index], ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3)
+        fill = -index.shape[0] % self.chunk
+        chunks = jnp.pad(jnp.asarray(self.positions)[index], ((0, fill), (0, 0)), mode="edge").reshape(-1, self.chunk, 3)
         found = jax.lax.map(lambda p: self.project(p), chunks)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: index.shape[0]], found)
 
@@ -66,10 +66,10 @@ class AbstractProjection(eqx.Module):
 
 def project_all(projection: AbstractProjection, active: Bool[Array, "nodes"]) -> tuple[Array, ...]:
     """What all nodes hold, zero where they are not `active`; chunks without an active node are left out. Traceable."""
-    p = projection.positions
-    fill = -len(p) % CHUNK
-    chunks = jnp.asarray(np.pad(p, ((0, fill), (0, 0)), mode="edge").reshape(-1, CHUNK, 3))
-    busy = jnp.pad(active, (0, fill)).reshape(-1, CHUNK)
+    p, chunk_size = projection.positions, projection.chunk
+    fill = -len(p) % chunk_size
+    chunks = jnp.asarray(np.pad(p, ((0, fill), (0, 0)), mode="edge").reshape(-1, chunk_size, 3))
+    busy = jnp.pad(active, (0, fill)).reshape(-1, chunk_size)
     # Not the bound method: JAX hashes what it is to call, and Equinox all that a method is bound to.
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda p: projection.project(p), chunks[0]))
 
@@ -84,3 +84,24 @@ def project_all(projection: AbstractProjection, active: Bool[Array, "nodes"]) ->
     order = dealt(len(chunks), shares())
     found = joined(over_rays(share, projection, (chunks[order], busy[order])), len(chunks), shares())
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(p)], found)
+
+
+@jax.custom_jvp
+def visible_nodes(projection: AbstractProjection) -> tuple[Array, ...]:
+    """What the active nodes of a scene hold. Where it is differentiated all of them do: what is not visible may become so, and has a
+    derivative in the light that reaches it."""
+    return projection.all_nodes()
+
+
+def _visible_nodes_rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    tangents = perturbed(primals, tangents)
+    moving, still = eqx.partition(primals, jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None))
+
+    def whole(moving: Any) -> tuple[Array, ...]:
+        (projection,) = eqx.combine(moving, still)
+        return project_all(projection, jnp.ones(math.prod(projection.shape), bool))
+
+    return jax.jvp(whole, (moving,), (tangents,))
+
+
+visible_nodes.defjvp(_visible_nodes_rule, symbolic_zeros=True)

@@ -62,6 +62,8 @@ KINDS: dict[type, dict[str, str]] = {
         "map": "ShadowMap",
         "opacity-map": "OpacityShadowMap",
         "deep-map": "DeepShadowMap",
+        "piecewise": "PiecewiseShadows",
+        "in-scattering": "InScattering",
     },
     AbstractSurfaces: {"isosurfaces": "Isosurfaces"},
     AbstractSpecular: {"specular": "Specular"},

@@ -1,5 +1,5 @@
-"""What depends on neither camera nor light, computed once: projected materials, radiance transfer, occlusion; kept on disk by their
-content."""
+"""What does not depend on the camera, computed once: projected materials, radiance transfer, occlusion, in-scattering; kept on disk by
+their content."""
 
 import dataclasses
 import hashlib
@@ -34,8 +34,8 @@ Progress = Callable[[float], Any]
 
 
 class Precomputed(NamedTuple):
-    """One part that was computed beforehand: `part`, "material", "radiance transfer" or "occlusion"; `seconds` that it took; `cached`,
-    whether it was read from the folder; `nbytes` of its numbers."""
+    """One part that was computed beforehand: `part`, "material", "radiance transfer", "occlusion" or "shadows"; `seconds` that it took;
+    `cached`, whether it was read from the folder; `nbytes` of its numbers."""
 
     part: str
     seconds: float
@@ -52,13 +52,14 @@ def precompute(
     keep_material: bool = False,
     keep_unscattered: bool = False,
 ) -> Scene:
-    """The scene with its material projected on harmonics, its radiance transfer and its occlusion computed, so that pictures from any
-    camera and under any light do none of it again. The material is kept up to order 3, or that of the environment (with an exact product,
-    of the transfer) where it is higher: of an environment of a still higher order no more than that is seen.
+    """The scene with its material projected on harmonics, its radiance transfer, its occlusion and its in-scattering computed, so that
+    pictures from any camera and, but for in-scattering, under any light do none of it again. The material is kept up to order 3, or that
+    of the environment (with an exact product, of the transfer) where it is higher: of an environment of a still higher order no more than
+    that is seen.
 
     All are constants from then on. After a change of the volume, the transfer function or the clipping box call it again, which computes
     what is of another scene anew (else `jvr.render` raises); a new material asks for it only with `jvr.MaterialBleeding()`. After a change
-    of the settings of `radiance_transfer` or `occlusion`, begin with a scene that has not been through here.
+    of the settings of `radiance_transfer`, `occlusion` or `shadows`, begin with a scene that has not been through here.
 
     **Arguments:** `cache`: a folder to keep results in, named by the content of what they were computed from; `progress`: called with the
     share that is done, 0 ... 1; `report`: called with each part once it is there; `keep_material`: leave the material as it is, and

@@ -73,13 +73,13 @@ class OpticalShader(AbstractShader):
 
 
 class LightPathShader(OpticalShader):
-    """What light passes on its way to a point: extinction alone, and no more than `densest` of it (see `jvr.march.medium.DENSEST`)."""
+    """What light passes on its way to a point, with no more than `densest` of extinction (see `jvr.march.medium.DENSEST`)."""
 
     densest: Scalar
 
     def classify(self, transfer: Any, sample: Sample) -> Classified:
-        rgb, sigma_t, _ = super().classify(transfer, sample)
-        return Classified(rgb, tuple(jnp.minimum(sigma, self.densest) for sigma in sigma_t))
+        found = super().classify(transfer, sample)
+        return found._replace(sigma_t=tuple(jnp.minimum(sigma, self.densest) for sigma in found.sigma_t))
 
 
 class PreIntegratedShader(OpticalShader):

@@ -92,6 +92,15 @@ def node_positions(volume: Volume, shape: Shape) -> Float[np.ndarray, "nodes 3"]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
 
 
+def fractions_at_voxels(
+    volume: Volume, nodes: Float[Array, "nodes channels"], resolution: float, *, least: float = 0.0
+) -> Float[Array, "x y z channels"]:
+    """Fractions of light at all nodes, from `least` to 1, on the grid of the voxels: straight lines between nodes would let light into
+    whatever is not much thicker than they are apart."""
+    coarse = nodes.reshape(*node_shape(volume, resolution), -1)
+    return jnp.clip(resampled_cubic(coarse, volume.shape), least, 1.0)
+
+
 def nodes_for_each_voxel(volume: Volume, shape: Shape) -> tuple[float, float, float]:
     """What takes a grid position to the coordinates of such a grid's nodes, along each axis."""
     x, y, z = ((m - 1) / (n - 1) if n > 1 else 0.0 for n, m in zip(volume.shape, shape, strict=True))

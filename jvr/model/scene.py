@@ -49,7 +49,7 @@ class Scene(AbstractPart):
     - `shading`: what surfaces make of light: `jvr.Lambert`, `jvr.Phong`, `jvr.BlinnPhong`,
       `jvr.PhenomenologicalBSDF`, or `None`: the medium glows as it is.
     - `shadows`: how much of each light reaches a point: `jvr.ShadowRays`, `jvr.ShadowVolume`, `jvr.ShadowMap`, `jvr.OpacityShadowMap`,
-      `jvr.DeepShadowMap`, or `None`: all of it.
+      `jvr.DeepShadowMap`, `jvr.PiecewiseShadows`, `jvr.InScattering` around any of them, or `None`: all of it.
     - `scattering`: what the medium makes of light: `jvr.SingleScattering` or `None`.
     - `environment`: light from far away in all directions: `jvr.EnvironmentLight`, `jvr.EnvironmentMap` or `None`; adds to those among
       `lights`.

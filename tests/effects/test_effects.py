@@ -17,6 +17,9 @@ from jvr.rendering.advise import effects_of, remarks_on
 
 MODULES = ("lighting", "shading", "scattering", "shadow_rays", "shadow_volume", "shadow_map", "deep_shadow_map", "light_space")
 MODULES += (
+    "piecewise_shadows",
+    "in_scattering",
+    "short_rays",
     "environment_lighting",
     "radiance_transfer",
     "radiance_transfer_grid",

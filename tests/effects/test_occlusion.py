@@ -107,6 +107,22 @@ def test_a_homogeneous_ball_has_the_closed_form(sigma):
         assert factors(homogeneous(sigma, occlusion))[3, 3, 3, 0] == pytest.approx(phi1(2.5 * opaque), abs=2e-6)
 
 
+def test_what_glows_lights_what_is_near():
+    """`(1 + c_E) phi1(sigma (R - a))` with `c_E` the `glow` times the emission, in each colour; and its derivative in the emission."""
+    one, emission = homogeneous(0.5, local(3.0, 0.5, glow=2.0)), np.array([0.0, 0.1, 3.0])
+    one = dataclasses.replace(one, transfer=dataclasses.replace(one.transfer, emission=jnp.asarray([emission] * 4)))
+    np.testing.assert_allclose(factors(one)[3, 3, 3], (1 + 2 * emission) * phi1(1.25), rtol=1e-5)
+
+    def lit(emission):
+        glowing = dataclasses.replace(one, transfer=dataclasses.replace(one.transfer, emission=emission))
+        return jnp.sum(visibility(glowing).grid.rows.reshape(*SHAPE, 3)[3, 3, 3])
+
+    slope = jax.grad(lit)(one.transfer.emission)
+    np.testing.assert_allclose(np.sum(slope, axis=0), -2 * phi1(1.25), rtol=1e-5)
+    with pytest.raises(ValueError, match=r"nothing glows: give the transfer function emission="):
+        visibility(homogeneous(0.5, local(3.0, glow=1.0)))
+
+
 def test_a_half_space_leaves_half():
     """A node on a face of the volume, with nothing beyond: `(1 + phi1(sigma (R - a))) / 2`, a half where that is opaque; on an edge and
     in a corner what is left is that of three and seven octants more."""

@@ -40,6 +40,7 @@ SUN, LAMP = jvr.DirectionalLight([0.0, 0.0, -1.0], 3.0), jvr.PointLight([10.0, 1
                 (SUN, jvr.ShadowVolume(1.0), 1.5),
                 (LAMP, jvr.ShadowVolume(1.0), 1.5),
                 (SUN, jvr.DeepShadowMap(64), 1.0),
+                (LAMP, jvr.PiecewiseShadows(), 0.0),
             )
         ),
     ],

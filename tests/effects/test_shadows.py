@@ -61,6 +61,7 @@ REFINED = {
     "volume": (jvr.ShadowVolume(1 / 3), jvr.ShadowVolume(4 / 3), 0.15),
     "opacity map": (jvr.OpacityShadowMap(10, 10), jvr.OpacityShadowMap(40, 40), 0.15),
     "deep map": (jvr.DeepShadowMap(10, 6, error=0.04), jvr.DeepShadowMap(40, 20, error=0.0025), 0.2),
+    "piecewise": (jvr.PiecewiseShadows(2, 1 / 4), jvr.PiecewiseShadows(2, 1.0), 0.25),
 }
 
 
@@ -242,6 +243,7 @@ SHADOWS = {
     "volume": jvr.ShadowVolume(1.0),
     "opacity map": jvr.OpacityShadowMap(7, 6),
     "deep map": jvr.DeepShadowMap(6, 4, error=0.02),
+    "piecewise": jvr.PiecewiseShadows(0.8, 0.6),
 }
 # Sheared: where all corners are equally far from the middle, how far light is fanned out has a kink.
 SHEARED = OBLIQUE @ np.array([[1, 0.1, -0.05, 0], [0, 1, 0.15, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
@@ -313,9 +315,7 @@ def along_each(p, moves, shadows, h=1e-6):
     return (np.asarray(above) - np.asarray(below)) / (2 * h)
 
 
-@pytest.mark.parametrize(
-    "method", ["none", *(pytest.param(m, marks=pytest.mark.slow) for m in ("rays", "volume", "opacity map", "deep map"))]
-)
+@pytest.mark.parametrize("method", ["none", *(pytest.param(m, marks=pytest.mark.slow) for m in SHADOWS if m != "none")])
 def test_replay_against_central_differences(method, x64):
     """Along a random direction in each kind of array: transfer function, voxels, lights, pose, camera, phase function, albedo."""
     p, shadows = parameters(), SHADOWS[method]
@@ -441,6 +441,8 @@ def test_vmap_of_gradients_through_shadows(x64):
         "threshold": (lambda: jvr.ShadowMap(threshold=1.0), ValueError),
         "softness": (lambda: jvr.ShadowMap(softness=-1), ValueError),
         "bias": (lambda: jvr.ShadowMap(bias=-1.0), ValueError),
+        "piece": (lambda: jvr.PiecewiseShadows(-1), ValueError),
+        "nodes": (lambda: jvr.PiecewiseShadows(resolution=1.5), ValueError),
         "texels of a map": (lambda: jvr.ShadowMap(1), ValueError),
     }.values(),
     ids=lambda x: "",

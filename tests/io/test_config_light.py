@@ -104,6 +104,12 @@ TABLE = "{positions=[0.1,0.9],values=[0.2,0.4]}"
         ("shadows", "'rays'", jvr.ShadowRays()),
         ("shadows", "{kind='rays',step=2,termination=0}", jvr.ShadowRays(2, termination=0)),
         ("shadows", "{kind='volume',resolution=0.5}", jvr.ShadowVolume(0.5)),
+        ("shadows", "{kind='piecewise',piece=4}", jvr.PiecewiseShadows(4)),
+        (
+            "shadows",
+            "{kind='in-scattering',rays=8,radius=3,bias=0.1,direct={kind='rays',step=2}}",
+            jvr.InScattering(8, radius=3, bias=0.1, direct=jvr.ShadowRays(2)),
+        ),
         ("shadows", "'map'", jvr.ShadowMap()),
         (
             "shadows",

@@ -19,6 +19,8 @@ PARTS = {
         jvr.ShadowMap(2),
         jvr.OpacityShadowMap(2, 1),
         jvr.DeepShadowMap(3, 2, error=0.02),
+        jvr.PiecewiseShadows(2, 0.25),
+        jvr.InScattering(),
     ),
     "normals": (jvr.AnalyticGradient(), jvr.CentralDifferences(True), jvr.SobelDifferences(), jvr.PrecomputedGradient()),
     "occlusion": (jvr.LocalOcclusion(), jvr.HistogramOcclusion(2, 3, resolution=1.0)),

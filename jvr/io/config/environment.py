@@ -28,8 +28,11 @@ from jvr.model.material import AbstractBRDF
 from jvr.model.scene import Scene, material_order
 
 Precompute = Callable[..., Scene]
-# Parts of the scene that occlusion is computed from.
-SHAPES_OCCLUSION = ("transfer", "volume", "clipping", "occlusion")
+# Parts of the scene that occlusion and in-scattering are computed from.
+SHAPES = {
+    "occlusion": ("transfer", "volume", "clipping", "occlusion"),
+    "shadows": ("transfer", "volume", "clipping", "lights", "geometry", "shadows"),
+}
 
 
 def environment_parts(config: Config) -> dict[str, Any]:
@@ -101,9 +104,8 @@ def fit_scene(config: Config, scene: Scene, precompute: Precompute) -> Scene:
         keep = {"keep_material": _fits(config, "material"), "keep_unscattered": _fits(config, "radiance_transfer")}
     if table is not None and not table.frozen and _fits(config, *_shapes_radiance_transfer(table)):
         later["radiance_transfer"] = scene.radiance_transfer
-    # Occlusion follows the unknowns, as the light that it takes away is a part of what they explain.
-    if scene.occlusion is not None and _fits(config, *SHAPES_OCCLUSION):
-        later["occlusion"] = scene.occlusion
+    # They follow the unknowns, as the light that they take away is a part of what these explain.
+    later |= {part: getattr(scene, part) for part, of in SHAPES.items() if part in scene.precomputable and _fits(config, *of)}
     return dataclasses.replace(precompute(dataclasses.replace(scene, **dict.fromkeys(later)), **keep), **later)
 
 
