@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt32
 
 from jvr.effects.grid import Grid
-from jvr.effects.nodes import AbstractProjection, project_all
+from jvr.effects.nodes import AbstractProjection, project_all, seen_around
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.rules import perturbed
 from jvr.march.secondary import SecondaryRays, channel_count, secondary_rays, take_midpoint
@@ -112,18 +112,22 @@ class LocalOcclusion(AbstractOcclusion):
 
     @property
     def stale_message(self) -> str:
-        return stale_message("occlusion", "occlusion", "transfer function, volume, clipping box, radius or offset")
+        return stale_message(
+            "occlusion", "occlusion", "transfer function, volume, clipping box, radius, offset or presence of surfaces"
+        )
 
     def sources(self, scene: Scene) -> Any:
         volume, graded = scene.volume, scene.transfer.takes_gradient
         parts = [volume.values, volume.gaps, volume.slope, volume.intercept, volume.world_from_grid, volume.interpolation]
+        # Where there are surfaces, nodes away from the visible medium are computed, too.
+        parts.append(np.array([scene.surfaces is not None]))
         return parts, scene.transfer, scene.clipping, scene.normals if graded else None, self.radius, self.offset
 
     def projection(self, scene: Scene, path: LightPath) -> "OcclusionProjection":
         return OcclusionProjection(
             volume=scene.volume,
             clipping=scene.clipping,
-            medium=path(scene.transfer.takes_gradient),
+            medium=seen_around(scene, path(scene.transfer.takes_gradient)),
             reach=Reach.of(self, scene.volume),
             rays=self.rays,
             resolution=self.resolution,

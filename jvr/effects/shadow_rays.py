@@ -1,9 +1,11 @@
 """Shadow rays: the transmittance between a point and a light, marched."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from jvr.effects.shadow_volume import ShadowVolume
 from jvr.march.adjoint import replay_march
@@ -11,7 +13,7 @@ from jvr.march.fields import VoxelField
 from jvr.march.march import Marched, MarchOptions, march
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Rays, Transmittances
-from jvr.model.clipping import Clipping, interval_inside
+from jvr.model.clipping import Clipping, Line, interval_inside
 from jvr.model.effects import AbstractShadows
 from jvr.model.geometry import AbstractGeometry
 from jvr.model.light import AbstractDeltaLight
@@ -19,8 +21,9 @@ from jvr.model.parameters import assign, choice
 from jvr.model.parts import AbstractPart, Knob, multiples
 from jvr.model.ranges import POSITIVE, TRANSMITTANCE
 from jvr.model.scene import Scene
+from jvr.model.volume import Volume
 from jvr.numerics import smaller
-from jvr.types import Channels, Scalar
+from jvr.types import Channels, Scalar, Triple
 
 
 class ShadowRays(AbstractShadows):
@@ -85,13 +88,29 @@ class RayVisibility(AbstractVisibility):
         """From the points to a light; without length where they are not wanted, or geometry is in the way, and where that is."""
         field = self.medium.field
         assert isinstance(field, VoxelField)
-        volume = field.volume
-        x = volume.world_from_point(points.p)
-        # No light that casts shadows depends on where the eye is.
-        w_i, distance, _ = jax.vmap(lambda x: light.sample(x, x))(x)
-        along = volume.grid_from_world(w_i, direction=True)
-        length = smaller(interval_inside(volume, self.clipping, (x, w_i), (points.p, along))[1], distance)
-        blocked = None if self.geometry is None else self.geometry.hit((x, w_i), 0.0, 0.0, None)[0] < distance
-        reaches = wanted & (length > 0) if blocked is None else wanted & (length > 0) & ~blocked
+        ways = ways_to(light, field.volume, self.clipping, points.p)
+        blocked = None if self.geometry is None else self.geometry.hit(ways.world, 0.0, 0.0, None)[0] < ways.distance
+        reaches = wanted & (ways.end > 0) if blocked is None else wanted & (ways.end > 0) & ~blocked
         keep = lambda v: tuple(jnp.where(reaches, c, 0.0) for c in v)
-        return Rays(keep(points.p), keep(along), jnp.where(reaches, length, 0.0)), blocked
+        return Rays(keep(points.p), keep(ways.along), jnp.where(reaches, ways.end, 0.0)), blocked
+
+
+class Ways(NamedTuple):
+    """The straight ways from points to a light: where they begin and their unit directions in the world, those in grid coordinates per
+    world length, the distances between which each is inside of the medium, and that of the light."""
+
+    world: Line
+    along: Triple
+    begin: Float[Array, "points"]
+    end: Float[Array, "points"]
+    distance: Float[Array, "points"]
+
+
+def ways_to(light: AbstractDeltaLight, volume: Volume, clipping: Clipping, p: Triple) -> Ways:
+    """The ways from grid positions to a light that casts shadows."""
+    x = volume.world_from_point(p)
+    # No light that casts shadows depends on where the eye is.
+    w_i, distance, _ = jax.vmap(lambda x: light.sample(x, x))(x)
+    along = volume.grid_from_world(w_i, direction=True)
+    begin, end = interval_inside(volume, clipping, (x, w_i), (p, along))
+    return Ways((x, w_i), along, begin, smaller(end, distance), distance)
