@@ -26,12 +26,18 @@ def lit(shadows):
     return jvr.Scene(scene.volume, scene.transfer, lights=lights, shading=jvr.BlinnPhong(), shadows=shadows)
 
 
+def with_surfaces():
+    surfaces = jvr.Isosurfaces([0.4, 0.6], np.full((2, 3), 0.8), [0.5, 0.6])
+    return eqx.tree_at(lambda s: s.surfaces, lit(jvr.ShadowRays()), surfaces, is_leaf=lambda x: x is None)
+
+
 SCENES = {
     "plain": (plain, jvr.Settings(0.7)),
     "tiles": (plain, jvr.Settings(0.7, tile=32)),
     "refinement": (plain, jvr.Settings(0.7, sampling=jvr.Refinement())),
     "shadow volume": (lambda: lit(jvr.ShadowVolume()), jvr.Settings(0.7)),
     "shadow rays": (lambda: lit(jvr.ShadowRays()), jvr.Settings(0.7)),
+    "surfaces": (with_surfaces, jvr.Settings(0.7)),
     "deep map": (lambda: lit(jvr.DeepShadowMap(16)), jvr.Settings(0.7)),
 }
 

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jvr.effects.lighting import LitShader
+from jvr.effects.surface_shadows import SurfaceShadows
 from jvr.march.first_hit import FINER, Hits, Reached, Search, leaving, next_hit, start, steepest_of
-from jvr.march.medium import Medium
+from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.occupancy import occupancy_of_values
 from jvr.march.steps import Point, Rays, points_at
 from jvr.model.bricks import Bricks
@@ -29,7 +30,8 @@ class Isosurfaces(AbstractSurfaces):
     shows (course notes on GPU-based volume ray-casting, Eurographics 2009, section 2.4).
 
     Without lights and shading a surface shows its `rgb`; with them it is shaded by the scene's `shading` or `material`, with the normal of
-    its `normals`, and lies in its shadows. Surfaces themselves cast none.
+    its `normals`, and lies in its shadows. In a scene with `shadows` surfaces cast them on the medium and on each other, whichever method
+    finds those of the medium: a ray from each point to each light. They take no ambient and no environment light from anything.
 
     **Arguments:**
 
@@ -44,11 +46,12 @@ class Isosurfaces(AbstractSurfaces):
       thinner than that along a ray.
     - `tolerance`: how near to a crossing its distance is, in voxels.
     - `most`: surfaces that a ray passes at most, where they are not opaque; of those behind the last nothing is seen.
+    - `casts_shadows`: whether they do, which takes a ray more for each light and each sample of a lit medium, where there is any.
 
     Differentiable in values, colours, opacities, voxels and pose, in both modes, by the implicit function theorem, and along surfaces in
-    their normals. Detached: which rays hit. A silhouette moves with what is unknown, and that part of a derivative is missing; next
-    to it distances change infinitely fast, which is limited to a slope of 1000. **Raises** `ValueError` for values that do not
-    ascend and numbers out of range.
+    their normals. Detached: which rays hit, and where shadows end. A silhouette moves with what is unknown, and that part of a derivative
+    is missing; next to it distances change infinitely fast, which is limited to a slope of 1000. **Raises** `ValueError` for values that do
+    not ascend and numbers out of range.
     """
 
     values: Float[Array, "n"] = parameter(INCREASING, doc="isovalues, ascending", unit="data units")
@@ -60,6 +63,7 @@ class Isosurfaces(AbstractSurfaces):
     guaranteed: bool = choice(doc="whether steps are bounded by gradients, so that nothing is missed")
     tolerance: float = choice(Interval(1e-6, 0.5), doc="of a distance", unit="voxels of the smallest spacing")
     most: int = choice(AT_LEAST_ONE, doc="surfaces that a ray passes", most=64)
+    casts_shadows: bool = choice(doc="whether they cast shadows, where the scene has any")
 
     def __init__(
         self,
@@ -73,9 +77,10 @@ class Isosurfaces(AbstractSurfaces):
         guaranteed: bool = False,
         tolerance: float | int = 1e-4,
         most: int = 4,
+        casts_shadows: bool = True,
     ):
         assign(self, values=values, rgb=rgb, opacity=opacity, band=band, step=step, coarse=coarse)
-        assign(self, guaranteed=guaranteed, tolerance=tolerance, most=most)
+        assign(self, guaranteed=guaranteed, tolerance=tolerance, most=most, casts_shadows=casts_shadows)
         if guaranteed and band is not None:
             raise ValueError("guaranteed steps are as long as gradients allow: leave band out, or guaranteed at False")
 
@@ -91,7 +96,8 @@ class Isosurfaces(AbstractSurfaces):
             rate = "steps bounded by gradients"
         elif self.band is not None:
             rate = f"a sample every {self.step:g} or {self.coarse * self.step:g} voxels"
-        return (PlanEntry(name, True, f"{many}: {rate}{empty}"),)
+        shade = "; they cast shadows" if scene.shadows is not None and self.casts_shadows else ""
+        return (PlanEntry(name, True, f"{many}: {rate}{empty}{shade}"),)
 
     def knobs(self, scene: Any) -> tuple[Knob, ...]:
         tolerance = multiples("tolerance", self.tolerance, (1000, 100, 10, 1), 1 / 10, least=1e-6, most=0.5)
@@ -125,6 +131,11 @@ class Isosurfaces(AbstractSurfaces):
         if isinstance(shader, LitShader) and (shader.shading is not None or shader.environment is not None):
             colour = _lit(shader, medium, rays, hits, colour)
         return colour, opacity
+
+    def shadowed(self, prepared: Search, scene: Scene, visible: AbstractVisibility | None) -> AbstractVisibility | None:
+        if visible is None or scene.shadows is None or not self.casts_shadows:
+            return visible
+        return SurfaceShadows(visible, prepared, scene.clipping, scene.shadow_casters, self.opacity, self.most)
 
 
 def hit_points(rays: Rays, hits: Hits) -> Point:

@@ -15,6 +15,7 @@ from jvr.execution.tiles import dealt, joined
 from jvr.march.medium import Medium
 from jvr.march.rules import perturbed
 from jvr.model.grids import Shape, node_positions
+from jvr.model.scene import Scene
 from jvr.model.volume import Volume
 
 
@@ -62,6 +63,11 @@ class AbstractProjection(eqx.Module):
     def all_nodes(self) -> tuple[Array, ...]:
         """`project_all` of those that are active."""
         return project_all(self, self.active())
+
+
+def seen_around(scene: Scene, medium: Medium) -> Medium:
+    """The medium around nodes that are worth it near what is visible of it, and everywhere where surfaces may show what they hold."""
+    return medium if scene.surfaces is None else medium._replace(occupancy=None)
 
 
 def project_all(projection: AbstractProjection, active: Bool[Array, "nodes"]) -> tuple[Array, ...]:

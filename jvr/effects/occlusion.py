@@ -8,10 +8,11 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, UInt32
 
 from jvr.effects.grid import Grid
-from jvr.effects.nodes import AbstractProjection, visible_nodes
+from jvr.effects.nodes import AbstractProjection, seen_around, visible_nodes
 from jvr.effects.short_rays import Reach, mean_light, short_rays, sources_of_rays
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Transmittances
@@ -114,16 +115,20 @@ class LocalOcclusion(AbstractOcclusion):
 
     @property
     def stale_message(self) -> str:
-        return stale_message("occlusion", "occlusion", "transfer function, volume, clipping box, radius, offset or glow")
+        return stale_message(
+            "occlusion", "occlusion", "transfer function, volume, clipping box, radius, offset, glow or presence of surfaces"
+        )
 
     def sources(self, scene: Scene) -> Any:
-        return *sources_of_rays(scene), self.radius, self.offset, self.glow
+        # Where there are surfaces, nodes away from the visible medium are computed, too.
+        surfaces = np.array([scene.surfaces is not None])
+        return *sources_of_rays(scene), surfaces, self.radius, self.offset, self.glow
 
     def projection(self, scene: Scene, path: LightPath) -> "OcclusionProjection":
         return OcclusionProjection(
             volume=scene.volume,
             clipping=scene.clipping,
-            medium=path(scene.transfer.takes_gradient),
+            medium=seen_around(scene, path(scene.transfer.takes_gradient)),
             reach=Reach.of(self, scene.volume),
             glow=self.glow,
             rays=self.rays,

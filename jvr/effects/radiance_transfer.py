@@ -119,8 +119,8 @@ class RadianceTransfer(AbstractRadianceTransfer):
 
     @property
     def stale_message(self) -> str:
-        what = ("transfer function", "volume", "clipping box", *(["material"] if self.rays_need_gradient else []), "or dipole")
-        return stale_message("radiance transfer", "radiance_transfer", ", ".join(what))
+        what = ("transfer function", "volume", "clipping box", *(["material"] if self.rays_need_gradient else []), "dipole")
+        return stale_message("radiance transfer", "radiance_transfer", ", ".join(what) + " or presence of surfaces")
 
     def knobs(self, scene: Any) -> tuple[Knob, ...]:
         product = (Knob("exact", (False, True), True),) if self.exact else ()
@@ -209,6 +209,8 @@ class RadianceTransfer(AbstractRadianceTransfer):
         parts.append(scene.material if self.rays_need_gradient else None)
         # Above a surface rays begin in front of it.
         parts.append(np.array([scene.material is not None and scene.material.needs_gradient]))
+        # Where there are surfaces, nodes away from the visible medium are projected, too.
+        parts.append(np.array([scene.surfaces is not None]))
         is_scattered = self.scattering is not None and (self.projected is None or self.projected.scattered)
         return parts, self.scattering if is_scattered else None
 

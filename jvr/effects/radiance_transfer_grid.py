@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from jvr.effects.environment_lighting import EnvironmentLighting, albedo_of
 from jvr.effects.grid import Grid
-from jvr.effects.nodes import AbstractProjection
+from jvr.effects.nodes import AbstractProjection, seen_around
 from jvr.effects.projected_radiance_transfer import ProjectedRadianceTransfer
 from jvr.effects.radiance_transfer import RadianceTransfer
 from jvr.effects.radiance_transfer_nodes import project_nodes
@@ -106,7 +106,7 @@ class RadianceTransferProjection(AbstractProjection):
             radiance_transfer=radiance_transfer,
             volume=scene.volume,
             clipping=scene.clipping,
-            medium=medium,
+            medium=seen_around(scene, medium),
             albedo=albedo_of(scene),
             surfaces=scene.material.needs_gradient,
         )

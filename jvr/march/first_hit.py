@@ -182,15 +182,9 @@ def next_hit(search: Search, rays: Rays, reached: Reached) -> Hits:
     """
     found = _brackets(search, rays, reached)
     u, samples = _enclosed(search, rays, found)
-    after = jnp.where(found.rises, found.side + 1, found.side - 1)
     there = found.there
-    return Hits(
-        jnp.where(there, u, 0.0),
-        jnp.where(there, found.surface, 0),
-        there,
-        Reached(u, found.k, after, there),
-        found.steps + jnp.where(there, samples, 0),
-    )
+    steps = found.steps + jnp.where(there, samples, 0)
+    return Hits(jnp.where(there, u, 0.0), jnp.where(there, found.surface, 0), there, found.beyond(u), steps)
 
 
 def _rule(primals: tuple[Search, Rays, Reached], tangents: tuple[Search, Rays, Reached]) -> tuple[Hits, Hits]:
@@ -228,6 +222,22 @@ def _inverse_slope(volume: Volume, rays: Rays, hits: Hits) -> Float[Array, "rays
     return divide_or_zero(jnp.ones_like(slope), jnp.copysign(jnp.maximum(jnp.abs(slope), least), slope))
 
 
+def passed(search: Search, rays: Rays, opacity: Float[Array, "n"] | None, most: int) -> Float[Array, "rays"]:
+    """How much light gets through the surfaces on each ray: the product of `1 - opacity` of those that it crosses, `most` at most; without
+    an `opacity` nothing through any. Differentiable in that alone."""
+    search, rays = jax.lax.stop_gradient((search, rays))
+    reached, clear = start(search, rays), jnp.ones_like(rays.length)
+    if opacity is None:
+        return jnp.where(_brackets(search, rays, reached).there, 0.0, clear)
+
+    def cross(carry: tuple[Reached, Float[Array, "rays"]], _: None) -> tuple[tuple[Reached, Float[Array, "rays"]], None]:
+        reached, clear = carry
+        found = _brackets(search, rays, reached)
+        return (found.beyond(found.front), jnp.where(found.there, clear * (1 - opacity[found.surface]), clear)), None
+
+    return jax.lax.scan(cross, (reached, clear), length=most)[0][1]
+
+
 class _Brackets(NamedTuple):
     """Between which distances rays cross a surface, if they do; `side`: in front of it."""
 
@@ -243,6 +253,10 @@ class _Brackets(NamedTuple):
     def surface(self) -> Int[Array, "rays"]:
         """The index of the isovalue that is crossed."""
         return jnp.where(self.rises, self.side, self.side - 1)
+
+    def beyond(self, u: Float[Array, "rays"]) -> Reached:
+        """Where rays go on that cross it at distance `u`."""
+        return Reached(u, self.k, jnp.where(self.rises, self.side + 1, self.side - 1), self.there)
 
 
 class _Far(NamedTuple):

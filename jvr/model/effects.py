@@ -128,6 +128,11 @@ class AbstractSurfaces(AbstractPart):
         """Radiance towards the eye of what rays meet in a medium, under the light that reaches it, and how opaque it is; 0 where they meet
         nothing."""
 
+    @abc.abstractmethod
+    def shadowed(self, prepared: Any, scene: Any, visible: Any) -> Any:
+        """What reaches points of a scene's lights past the surfaces, as `AbstractPart.visibility`, where `visible` says what does of all
+        light without them."""
+
 
 class AbstractSpecular(AbstractPart):
     """How surfaces send rays on: mirrored, straight, or bent."""

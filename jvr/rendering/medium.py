@@ -68,11 +68,14 @@ def prepare(
     """What rays through a scene near its volume need to know beforehand. `skips`: whether they skip empty bricks; `visible`: how much light
     reaches a point, where that is known."""
     occupied = occupancy(scene, settings) if skips else None
-    visible = visibility(scene, occupied) if visible is None else visible
-    lighting = _lighting().prepare(scene) if scene.shows_light else None
     search = None
     if scene.surfaces is not None:
         search = scene.surfaces.prepare(scene, bricks(scene.volume) if settings.skipping else None)
+    if visible is None:
+        visible = visibility(scene, occupied)
+        if scene.surfaces is not None:
+            visible = scene.surfaces.shadowed(search, scene, visible)
+    lighting = _lighting().prepare(scene) if scene.shows_light else None
     return Prepared(scene, dataclasses.replace(settings, step=1.0), dt, occupied, visible, lighting, search)
 
 

@@ -301,6 +301,30 @@ def test_derivatives_of_pictures_are_those_of_differences(x64, method):
 
 
 @pytest.mark.slow
+def test_what_becomes_visible_does_so_in_the_light_that_is_left_there(x64):
+    """Far from all that is visible: an entry of zero there has a derivative, by the light that the visible part leaves, although no picture
+    needs to know that light before."""
+    values = np.full((25, 12, 12), 0.2)
+    values[:5] = 0.6 + 0.3 * voxels((5, 12, 12))
+    transfer = jvr.LinearTransfer([0.1, 0.3, 0.6, 0.9], voxels((4, 3)), [0.0, 0.0, 3.0, 5.0])
+    occlusion = jvr.LocalOcclusion(64, radius=32.0, offset=0.5, samples=16)
+    one = scene(occlusion, volume=jvr.Volume(values), transfer=transfer)
+    camera = jvr.OrthographicCamera.look_at([20, 5.5, 40], [20, 5.5, 0], [0, 1, 0], 2.0, 2, 2)
+
+    @jax.jit
+    def seen(one, sigma):
+        moved = eqx.tree_at(lambda s: s.transfer.sigma_t, one, sigma)
+        return jnp.sum(jvr.render(moved, camera, jvr.Settings(0.7, termination=0)).rgb)
+
+    sigma, h = one.transfer.sigma_t, 1e-6
+    expected = (seen(one, sigma.at[0].add(h)) - seen(one, sigma)) / h
+    gradient = jax.jit(jax.grad(seen, argnums=1))
+    assert gradient(one, sigma)[0] == pytest.approx(float(expected), rel=1e-4)
+    bare = one.replaced(occlusion=None)
+    assert gradient(bare, sigma)[0] > 1.01 * expected
+
+
+@pytest.mark.slow
 def test_forward_mode_agrees_with_reverse_mode(x64):
     one = differentiable("local")
     moving, still = eqx.partition(one, eqx.is_inexact_array)

@@ -1,5 +1,6 @@
 """Figures and the page of a fit: they show the arrays they were given, and the page stands on its own."""
 
+import dataclasses
 import re
 from html.parser import HTMLParser
 
@@ -140,6 +141,25 @@ def test_gaussians_are_curves_with_bars_at_their_centres():
     np.testing.assert_allclose(line(extinction, "_undetermined").get_xydata(), [[0.7, 1.0]], rtol=1e-6)
     bars = extinction.containers[0].lines[2][0].get_segments()
     np.testing.assert_allclose(bars, [[[0.3, 1.8], [0.3, 2.2]]], rtol=1e-6)
+
+
+def test_emission_has_a_panel_where_there_is_any(table):
+    """Of the fitted one, with its errors, and of the true one where that alone glows."""
+    glow = np.where(np.arange(N)[:, None] == 1, 1e6, RGB / 10)
+    glowing, errors = dataclasses.replace(table, emission=glow), np.full((N, 3), 0.05)
+    errors[1] = np.inf
+    truth = jvr.LinearTransfer([-900.0, 0.0, 300.0], np.eye(3), [0.0, 1.0, 0.5], emission=np.eye(3)[::-1])
+    assert "emission" not in panels(plot_transfer(table))
+    shown = panels(plot_transfer(glowing, standard_errors={"emission": errors}, truth=truth))["emission"]
+    for c, name in enumerate(("red", "green", "blue")):
+        np.testing.assert_allclose(line(shown, name).get_ydata(), glow[:, c], rtol=1e-6)
+    np.testing.assert_allclose(line(shown, "true").get_ydata(), [0, 0, 1])
+    np.testing.assert_allclose(spans(shown), [(-900, -700)], atol=1e-3)
+    assert shown.get_ylim()[1] < 2
+    alone = panels(plot_transfer(table, truth=truth))["emission"]
+    np.testing.assert_allclose(line(alone, "true").get_ydata(), [0, 0, 1])
+    gaussians = jvr.GaussianTransfer([0.5], [0.1], [0.0], np.ones((1, 3)), emission=[[1.0, 2.0, 3.0]])
+    assert line(panels(plot_transfer(gaussians))["emission"], "blue").get_ydata().max() == pytest.approx(3, rel=1e-3)
 
 
 @pytest.mark.parametrize("as_mapping", [True, False])

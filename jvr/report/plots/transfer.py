@@ -25,11 +25,13 @@ SAMPLES = 512
 
 
 class _Curve(NamedTuple):
-    """A transfer function at the values `s` where it is drawn: linear colours and extinction, one column or three."""
+    """A transfer function at the values `s` where it is drawn: linear colours, extinction, one column or three, and emission of its own,
+    `None` where it has none."""
 
     s: np.ndarray
     rgb: np.ndarray
     sigma_t: np.ndarray
+    emission: np.ndarray | None
 
 
 def plot_transfer(
@@ -40,7 +42,8 @@ def plot_transfer(
     histogram: Any = None,
     xlabel: str = "scalar value",
 ) -> "Figure":
-    """Colour strips, extinction and colours of a fitted transfer function against the scalar value, beside the true one.
+    """Colour strips, extinction, colours and, where there is any, emission of a fitted transfer function against the scalar value, beside
+    the true one.
 
     The band is one standard error to each side. Entries whose error is infinite are drawn hollow on a hatched ground. The
     extinction axis spans the true curve and the entries that are determined; others may lie outside.
@@ -56,21 +59,25 @@ def plot_transfer(
     span = min(_ends(transfer)[0] for transfer in drawn), max(_ends(transfer)[1] for transfer in drawn)
     found, true = _curve(fitted, span), None if truth is None else _curve(truth, span)
     strips = list(zip(("true", "fitted")[-len(drawn) :], drawn, strict=True))
-    figure = Figure(figsize=(WIDTH, 5.6 + 0.3 * len(strips)), layout="constrained")
-    rows = figure.subplots(
-        len(strips) + 2, 1, sharex=True, gridspec_kw={"height_ratios": [0.3] * len(strips) + [2.9, 2.1], "hspace": 0.02}
-    )
-    for axes, (name, transfer) in zip(rows[:-2], strips, strict=True):
+    glows = found.emission is not None or (true is not None and true.emission is not None)
+    heights = [0.3] * len(strips) + [2.9, 2.1] + [2.1] * glows
+    figure = Figure(figsize=(WIDTH, 0.6 + sum(heights)), layout="constrained")
+    rows = figure.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights, "hspace": 0.02})
+    for axes, (name, transfer) in zip(rows, strips, strict=False):
         _strip(axes, name, transfer, span)
-    unknown_colour, unknown_extinction = _undetermined(errors.get("rgb")), _undetermined(_extinction_errors(errors))
-    is_table = isinstance(fitted, AbstractTable)
-    if is_table:
-        for axes, unknown in ((rows[-3], unknown_colour), (rows[-2], unknown_extinction), (rows[-1], unknown_colour)):
-            _hatch(axes, found.s, unknown)
-    _extinction_panel(rows[-2], fitted, found, true, errors)
-    _colour_panel(rows[-1], fitted, found, true, errors)
+    extinction, colour = rows[len(strips)], rows[len(strips) + 1]
+    if isinstance(fitted, AbstractTable):
+        unknown_colour = _undetermined(errors.get("rgb"))
+        _hatch(rows[len(strips) - 1], found.s, unknown_colour)
+        _hatch(extinction, found.s, _undetermined(_extinction_errors(errors)))
+        _hatch(colour, found.s, unknown_colour)
+        _hatch(rows[-1], found.s, _undetermined(errors.get("emission")) if glows else None)
+    _extinction_panel(extinction, fitted, found, true, errors)
+    _colour_panel(colour, fitted, found, true, errors)
+    if glows:
+        _emission_panel(rows[-1], fitted, found, true, errors)
     if histogram is not None:
-        _histogram(rows[-2], histogram)
+        _histogram(extinction, histogram)
     rows[-1].set_xlabel(xlabel, color=INK)
     rows[-1].set_xlim(*span)
     return figure
@@ -89,14 +96,17 @@ def _curve(transfer: AbstractTransfer, span: tuple[float, float]) -> _Curve:
     """The entries of a table; anything else evaluated across `span`."""
     positions = getattr(transfer, "positions", None)
     if isinstance(transfer, AbstractTable) and positions is not None:
-        return _Curve(np.asarray(positions), np.asarray(transfer.rgb), _as_columns(np.asarray(transfer.sigma_t)))
+        own = getattr(transfer, "emission", None)
+        emission = None if own is None else np.asarray(own)
+        return _Curve(np.asarray(positions), np.asarray(transfer.rgb), _as_columns(np.asarray(transfer.sigma_t)), emission)
     return _sampled(transfer, np.linspace(*span, SAMPLES))
 
 
 def _sampled(transfer: AbstractTransfer, s: np.ndarray) -> _Curve:
     classified = jax.vmap(transfer.evaluate)(jnp.asarray(s, jnp.result_type(float)))
     stack = lambda columns: np.stack([np.broadcast_to(np.asarray(column), s.shape) for column in columns], axis=-1)
-    return _Curve(s, stack(classified.rgb), stack(classified.sigma_t))
+    emission = stack(classified.emission) if classified.emission else None
+    return _Curve(s, stack(classified.rgb), stack(classified.sigma_t), emission)
 
 
 def _as_columns(array: np.ndarray) -> np.ndarray:
@@ -148,7 +158,7 @@ def _extinction_panel(
         _lines(axes, found, found.sigma_t, spread, looks, points=len(found.s) <= MOST_POINTS)
     if true is not None:
         _true_lines(axes, true, true.sigma_t)
-    top = _highest(found.sigma_t, _undetermined(spread), true)
+    top = _highest(found.sigma_t, _undetermined(spread), None if true is None else true.sigma_t)
     axes.set_ylim(-0.03 * top, 1.12 * top)
     _legend(axes, spread, is_table=isinstance(fitted, AbstractTable))
 
@@ -166,6 +176,22 @@ def _colour_panel(
     known = found.rgb if spread is None else found.rgb[np.isfinite(spread)]
     low, high = float(min(known.min(initial=0.0), 0.0)), float(max(known.max(initial=1.0), 1.0))
     axes.set_ylim(low - 0.05, high + 0.05)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False)
+
+
+def _emission_panel(
+    axes: "Axes", fitted: AbstractTransfer, found: _Curve, true: _Curve | None, errors: dict[str, np.ndarray]
+) -> None:
+    style(axes, "emission\n(radiance / length)")
+    is_table = isinstance(fitted, AbstractTable)
+    spread, wanted = errors.get("emission") if is_table else None, None if true is None else true.emission
+    if found.emission is not None:
+        looks = tuple((name, colour, mark) for name, colour, mark in CHANNELS)
+        _lines(axes, found, found.emission, spread, looks, points=is_table and len(found.s) <= MOST_POINTS)
+    if true is not None and wanted is not None:
+        _true_lines(axes, true, wanted)
+    top = _highest(found.emission, _undetermined(spread), wanted)
+    axes.set_ylim(-0.03 * top, 1.12 * top)
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False)
 
 
@@ -230,10 +256,12 @@ def _height_bars(
         axes.plot(center[~known], height[~known, c], mark, color=colour, markerfacecolor="white", label="_undetermined", zorder=5)
 
 
-def _highest(sigma_t: np.ndarray, unknown: np.ndarray | None, true: _Curve | None) -> float:
-    """Where the extinction axis ends: an undetermined entry may have run off to anywhere and must not squeeze the rest."""
-    shown = sigma_t if unknown is None or len(unknown) != len(sigma_t) or unknown.all() else sigma_t[~unknown]
-    highest = max(float(shown.max(initial=0.0)), 0.0 if true is None else float(true.sigma_t.max(initial=0.0)))
+def _highest(columns: np.ndarray | None, unknown: np.ndarray | None, true: np.ndarray | None) -> float:
+    """Where an axis ends: an undetermined entry may have run off to anywhere and must not squeeze the rest."""
+    shown = np.zeros(0) if columns is None else columns
+    if unknown is not None and len(unknown) == len(shown) and not unknown.all():
+        shown = shown[~unknown]
+    highest = max(float(shown.max(initial=0.0)), 0.0 if true is None else float(true.max(initial=0.0)))
     return highest if highest > 0 else 1.0
 
 
