@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt32
 
 from jvr.effects.grid import Grid
-from jvr.effects.nodes import AbstractProjection, project_all, visible_nodes
+from jvr.effects.nodes import AbstractProjection, project_all, seen_around, surfaces_of, visible_nodes
 from jvr.effects.piecewise_shadows import PiecewiseShadows
 from jvr.effects.short_rays import Reach, mean_light, short_rays, sources_of_rays
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
@@ -107,25 +107,31 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
     @property
     def stale_message(self) -> str:
         return stale_message(
-            "in-scattering", "shadows", "light, transfer function, volume, clipping box, geometry, radius or offset"
+            "in-scattering",
+            "shadows",
+            "light, transfer function, volume, clipping box, geometry, radius, offset or presence of surfaces",
         )
 
     def sources(self, scene: Scene) -> Any:
-        return *sources_of_rays(scene), scene.shadow_casters, scene.light_blocker, self.direct, self.radius, self.offset
+        lit = scene.shadow_casters, scene.light_blocker, self.direct
+        return *sources_of_rays(scene), surfaces_of(scene), *lit, self.radius, self.offset
 
     def projection(self, scene: Scene, path: LightPath) -> "InScatteringProjection":
         volume, shape = scene.volume, node_shape(scene.volume, self.resolution)
+        medium = path(scene.transfer.takes_gradient)
+        # Rays read the light also where nothing is visible, up to the ball's radius away from what is.
+        everywhere: LightPath = lambda takes_gradient: path(takes_gradient)._replace(occupancy=None)
         incident = IncidentProjection(
             volume=volume,
-            medium=path(scene.transfer.takes_gradient),
-            visibility=self.direct.visibility(scene, path),
+            medium=medium,
+            visibility=self.direct.visibility(scene, everywhere),
             resolution=self.resolution,
         )
         (found,) = project_all(incident, jnp.ones(len(incident.positions), bool))
         return InScatteringProjection(
             volume=volume,
             clipping=scene.clipping,
-            medium=incident.medium,
+            medium=seen_around(scene, medium),
             reach=Reach.of(self, volume),
             incident=Grid.of(found.reshape(*shape, -1)),
             lights=sum(light is not None for light in scene.shadow_casters),

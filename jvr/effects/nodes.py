@@ -70,6 +70,11 @@ def seen_around(scene: Scene, medium: Medium) -> Medium:
     return medium if scene.surfaces is None else medium._replace(occupancy=None)
 
 
+def surfaces_of(scene: Scene) -> Bool[np.ndarray, "1"]:
+    """Whether `seen_around` has every node computed, as a source of what is kept of them."""
+    return np.array([scene.surfaces is not None])
+
+
 def project_all(projection: AbstractProjection, active: Bool[Array, "nodes"]) -> tuple[Array, ...]:
     """What all nodes hold, zero where they are not `active`; chunks without an active node are left out. Traceable."""
     p, chunk_size = projection.positions, projection.chunk

@@ -8,11 +8,10 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, UInt32
 
 from jvr.effects.grid import Grid
-from jvr.effects.nodes import AbstractProjection, seen_around, visible_nodes
+from jvr.effects.nodes import AbstractProjection, seen_around, surfaces_of, visible_nodes
 from jvr.effects.short_rays import Reach, mean_light, short_rays, sources_of_rays
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Transmittances
@@ -120,9 +119,7 @@ class LocalOcclusion(AbstractOcclusion):
         )
 
     def sources(self, scene: Scene) -> Any:
-        # Where there are surfaces, nodes away from the visible medium are computed, too.
-        surfaces = np.array([scene.surfaces is not None])
-        return *sources_of_rays(scene), surfaces, self.radius, self.offset, self.glow
+        return *sources_of_rays(scene), surfaces_of(scene), self.radius, self.offset, self.glow
 
     def projection(self, scene: Scene, path: LightPath) -> "OcclusionProjection":
         return OcclusionProjection(

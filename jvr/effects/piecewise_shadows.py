@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jvr.effects.grid import Grid
-from jvr.effects.nodes import AbstractProjection, visible_nodes
+from jvr.effects.nodes import AbstractProjection, seen_around, visible_nodes
 from jvr.effects.shadow_rays import RayVisibility, ways_to
 from jvr.march.march import MarchOptions
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
@@ -68,7 +68,7 @@ class PiecewiseShadows(AbstractShadows):
         beyond = BeyondProjection(
             volume=volume,
             clipping=scene.clipping,
-            medium=medium,
+            medium=seen_around(scene, medium),
             lights=casting,
             reach=reach,
             samples=max(samples, 1),

@@ -15,7 +15,7 @@ from scipy.ndimage import map_coordinates
 import jvr
 from jvr.io.config import build_cameras, build_scene, read_config
 from jvr.march.steps import Point
-from jvr.rendering.medium import visibility
+from jvr.rendering.medium import occupancy, visibility
 
 CONFIG = Path(__file__).parents[2] / "configs" / "inscattering.toml"
 
@@ -190,3 +190,30 @@ def test_the_configuration_says_what_it_draws():
         jvr.render(x, camera, jvr.Settings(8.0)).rgb for x in (dataclasses.replace(one, shadows=one.shadows.direct), one)
     )
     assert np.max(np.abs(scattered - direct)) > 0.02
+
+
+def test_empty_places_around_lie_in_the_shadow_of_what_is_far():
+    """A sheet above throws its shadow on the sheet below, and on the empty space that the ball of that one reaches into."""
+    values = np.zeros((9, 9, 41))
+    values[:, :, 36:39] = values[:, :, 2:5] = 1.0
+    transfer = jvr.LinearTransfer([0.0, 0.5, 1.0], np.zeros((3, 3)), [0.0, 0.0, 3.0])
+    shadows = jvr.InScattering(direct=jvr.PiecewiseShadows(4.0), radius=10.0, resolution=1.0)
+    one = scene(shadows, jvr.Volume(values), transfer)
+    at = np.array([[4.0, 4.0, 6.0], [4.0, 4.0, 37.0]])
+    skipping = occupancy(one, jvr.Settings())
+    assert skipping is not None
+    there = jax.jit(lambda one: visibility(one, skipping).transmittances(points(at), jnp.ones(2, bool), reverse=True).lights)
+    (dark, bright) = np.asarray(there(one)[0][0])
+    assert dark < 0.01 < bright
+
+
+def test_surfaces_in_empty_places_lie_in_the_shadow_of_what_is_far():
+    """An isosurface where the medium is invisible, a way behind a sheet that takes all light."""
+    values = np.zeros((9, 9, 41))
+    values[:, :, 36:39], values[:, :, :9] = 1.0, np.linspace(0.4, 0.0, 9)
+    transfer = jvr.LinearTransfer([0.0, 0.5, 1.0], np.zeros((3, 3)), [0.0, 0.0, 9.0])
+    looking = jvr.OrthographicCamera.look_at((4.0, -20.0, 12.0), (4.0, 4.0, 4.0), (0, 0, 1), 2.0, 3, 3)
+    shown = {"surfaces": jvr.Isosurfaces([0.2], [[1.0, 1.0, 1.0]]), "shading": jvr.Lambert(), "lights": (sun(),)}
+    lit = jvr.Scene(jvr.Volume(values), transfer, **shown)
+    shadowed = dataclasses.replace(lit, shadows=jvr.PiecewiseShadows(4.0))
+    assert np.max(render(shadowed, looking).rgb) < 0.01 < np.min(render(lit, looking).rgb)
