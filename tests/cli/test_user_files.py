@@ -265,7 +265,13 @@ def heard():
 
 @pytest.mark.parametrize(
     ("name", "seconds"),
-    [("SIGTERM", 1.0), *(pytest.param(n, s, marks=pytest.mark.slow) for n in ("SIGINT", "SIGTERM") for s in (0.5, 2, 4, 7))],
+    [
+        ("SIGTERM", 1.0),
+        *(
+            pytest.param(n, s, marks=pytest.mark.slow)
+            for n, s in (("SIGINT", 0.5), ("SIGTERM", 2), ("SIGINT", 4), ("SIGTERM", 7))
+        ),
+    ],
 )
 def test_a_signal_ends_a_command_in_one_line_whenever_it_comes(name, seconds, heard):
     """In imports, while something is compiled, while pictures are made."""

@@ -1,6 +1,7 @@
 """Environment lighting against brute force: directional lights with shadow rays, which know no harmonics and no nodes."""
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -47,36 +48,45 @@ def spiral(number, top):
     return np.stack([np.sqrt(1 - z * z) * np.cos(around), np.sqrt(1 - z * z) * np.sin(around), z], axis=-1)
 
 
-def lamp_and_sky(name):
-    """A disc lamp whose irradiance is pi where it is faced, a sky of radiance 1, or both: as an environment, and as directions with
-    irradiance over pi, as `jvr.Lambert` counts it."""
+# A disc lamp whose irradiance is pi where it is faced, a sky of radiance 1, or both.
+LIGHTS = {"lamp": ("lamp",), "sky": ("sky",), "both": ("lamp", "sky")}
+
+
+def environment_of(which):
     lamp = jvr.EnvironmentLight.disc(TOWARDS, HALF_ANGLE, math.pi / SOLID_ANGLE)
     sky = jvr.EnvironmentLight.constant(1.0, 3)
+    return {"lamp": lamp, "sky": sky, "both": lamp + sky}[which]
+
+
+def directions_of(part):
+    """The lamp or the sky as directions with irradiance over pi, as `jvr.Lambert` counts it."""
+    if part == "sky":
+        return spiral(32, 2.0), 4 / 32
     across = np.linalg.svd(TOWARDS[None])[2]
     frame = np.stack([across[1], across[2], TOWARDS])
-    of_lamp, of_sky = spiral(8, 1 - math.cos(math.radians(HALF_ANGLE))) @ frame, spiral(32, 2.0)
-    return {
-        "lamp": (lamp, of_lamp, np.full(8, 1 / 8)),
-        "sky": (sky, of_sky, np.full(32, 4 / 32)),
-        "both": (lamp + sky, np.concatenate([of_lamp, of_sky]), np.concatenate([np.full(8, 1 / 8), np.full(32, 4 / 32)])),
-    }[name]
+    return spiral(8, 1 - math.cos(math.radians(HALF_ANGLE))) @ frame, 1 / 8
 
 
-def brute_force(scene, camera, directions, irradiance):
-    """The picture under lights with shadow rays, one after the other, its opacity and its depth."""
+@jax.jit
+def lit_from(scene, camera, direction, irradiance):
+    """The picture under a light with shadow rays, its opacity and its depth."""
+    lit = dataclasses.replace(
+        scene,
+        lights=(jvr.DirectionalLight(-direction, irradiance * jnp.ones(3)),),
+        shading=jvr.Lambert(0.0, 1.0),
+        shadows=jvr.ShadowRays(0.5),
+    )
+    found = jvr.render(lit, camera, SETTINGS)
+    return found.rgb[..., 0], found.alpha, found.depth
 
-    def one(direction, irradiance):
-        lit = dataclasses.replace(
-            scene,
-            lights=(jvr.DirectionalLight(-direction, irradiance * jnp.ones(3)),),
-            shading=jvr.Lambert(0.0, 1.0),
-            shadows=jvr.ShadowRays(0.5),
-        )
-        found = jvr.render(lit, camera, SETTINGS)
-        return found.rgb[..., 0], found.alpha, found.depth
 
-    one = jax.jit(one)
-    pictures = [one(jnp.asarray(d, jnp.float32), jnp.float32(e)) for d, e in zip(directions, irradiance, strict=True)]
+@functools.cache
+def brute_force(name, part, n, size):
+    """A body under all directions of the lamp or the sky, one after the other, its opacity and its depth."""
+    scene = body(name, n)
+    directions, irradiance = directions_of(part)
+    camera = view(scene, size)
+    pictures = [lit_from(scene, camera, jnp.asarray(d, jnp.float32), jnp.float32(irradiance)) for d in directions]
     return np.sum([np.asarray(p[0], float) for p in pictures], axis=0), *map(np.asarray, pictures[0][1:])
 
 
@@ -99,11 +109,11 @@ def seen(scene, camera, alpha, depth):
 
 def compared(name, which, n, size, transfer):
     """Mean over brute force, and the spread of what is one where both are alike, over pixels that are lit."""
-    environment, directions, irradiance = lamp_and_sky(which)
     plain = body(name, n)
     camera = view(plain, size)
-    exact, alpha, depth = brute_force(plain, camera, directions, irradiance)
-    lit = dataclasses.replace(plain, environment=environment, material=jvr.LambertBRDF(), radiance_transfer=transfer)
+    parts = [brute_force(name, part, n, size) for part in LIGHTS[which]]
+    exact, (_, alpha, depth) = sum(part[0] for part in parts), parts[0]
+    lit = dataclasses.replace(plain, environment=environment_of(which), material=jvr.LambertBRDF(), radiance_transfer=transfer)
     found = np.asarray(jax.jit(jvr.render, static_argnums=2)(lit, camera, SETTINGS).rgb, float)[..., 0]
     wanted = seen(plain, camera, alpha, depth)
     wanted &= exact > 0.1 * np.max(exact[wanted])
@@ -121,7 +131,7 @@ def test_shares_of_the_light_against_brute_force():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("exact", [False, True])
-@pytest.mark.parametrize("which", ["lamp", "sky", "both"])
+@pytest.mark.parametrize("which", LIGHTS)
 @pytest.mark.parametrize("name", ["ball", "box", "half space"])
 def test_bodies_against_brute_force(name, which, exact):
     """The faces of a box meet in edges that a third of the voxels does not resolve."""

@@ -62,7 +62,7 @@ def random_like(tree, seed=1):
 # -- in the image plane
 
 
-@pytest.mark.parametrize("size", [(5, 3), *(pytest.param(size, marks=pytest.mark.slow) for size in ((1, 1), (2, 17), (45, 38)))])
+@pytest.mark.parametrize("size", [(5, 3), *(pytest.param(size, marks=pytest.mark.slow) for size in ((1, 1), (2, 17)))])
 def test_no_tolerance_traces_every_ray(size):
     s = scene()
     every, refined = (render(s, view(s, *size), sampled(way)) for way in (jvr.Uniform(), jvr.Refinement(0, tile=4)))
@@ -325,7 +325,7 @@ def test_uniform_matter_is_exact_with_the_coarsest_samples_alone():
     assert int(picture.stats.samples) < int(picture.stats.sampling.full) / 16
 
 
-@pytest.mark.parametrize("size", [(1, 1), (5, 3), (2, 17)])
+@pytest.mark.parametrize("size", [(1, 1), (2, 17)])
 @pytest.mark.slow
 def test_pictures_of_any_size(size):
     s = scene()

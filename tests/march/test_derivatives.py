@@ -1,5 +1,7 @@
 """Every way to differentiate a rendering against every other, and against central differences, for every kind of parameter."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -161,16 +163,29 @@ def test_tiles_and_no_jit(x64):
     ids=["replay", "forward", "rows, reverse", "rows, forward"],
 )
 def test_vmapped(transform, adjoint, x64):
-    """A batch of gradients is each gradient by itself. The batch differs in a perturbed and in a fixed array."""
+    """A batch of gradients is each gradient by itself, by replay. The batch differs in a perturbed and in a fixed array."""
+    agree(jax.jit(jax.vmap(gradient_of(transform, adjoint)))(*batch()), alone(), ROUNDING)
+
+
+def gradient_of(transform, adjoint):
+    """By the transfer function, which the camera's place stands beside."""
     p = parameters(TRANSFERS["linear"]())
     fixed = {k: v for k, v in p.items() if k not in ("transfer", "eye")}
-    gradient = lambda transfer, eye: transform(make_loss(fixed | {"eye": eye}, adjoint))({"transfer": transfer})
+    return lambda transfer, eye: transform(make_loss(fixed | {"eye": eye}, adjoint))({"transfer": transfer})
+
+
+def batch():
+    """Two transfer functions, each with a camera of its own."""
+    eye = parameters(TRANSFERS["linear"]())["eye"]
     transfers = [linear_transfer(seed=seed) for seed in (1, 5)]
-    eyes = jnp.stack([p["eye"], p["eye"] + jnp.array([0.5, 1.0, -0.7])])
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *transfers)
-    batch = jax.jit(jax.vmap(gradient))(stacked, eyes)
-    alone = jax.jit(lambda x: jax.lax.map(lambda x: gradient(*x), x))((stacked, eyes))
-    agree(batch, alone, ROUNDING)
+    return jax.tree.map(lambda *x: jnp.stack(x), *transfers), jnp.stack([eye, eye + jnp.array([0.5, 1.0, -0.7])])
+
+
+@functools.cache
+def alone():
+    """The gradients of the batch, one by one."""
+    gradient = gradient_of(jax.grad, jvr.Replay())
+    return jax.jit(lambda x: jax.lax.map(lambda x: gradient(*x), x))(batch())
 
 
 @pytest.mark.parametrize(
@@ -233,11 +248,20 @@ def each(p):
     [w if w in ("jacfwd", "checkpoint of vmap, shared") else pytest.param(w, marks=pytest.mark.slow) for w in FORWARDS_AND_BACK],
 )
 def test_one_rule_for_both_modes(way, x64):
+    loss, moving, gradient = of_several()
+    if way == "jacfwd":
+        others, moving = moving, {k: moving[k] for k in ("transfer", "background")}
+        loss, gradient = lambda p, loss=loss: loss(others | p), {k: gradient[k] for k in moving}
+    agree(jax.jit(FORWARDS_AND_BACK[way](loss))(moving), gradient, ROUNDING)
+
+
+@functools.cache
+def of_several():
+    """A loss of some kinds of array, where they are, and its gradient there."""
     p = parameters(TRANSFERS["table"]())
-    names = ("transfer", "background") if way == "jacfwd" else ("transfer", "background", "voxels", "eye")
-    loss = make_loss({k: v for k, v in p.items() if k not in names}, jvr.Replay())
-    moving = {k: p[k] for k in names}
-    agree(jax.jit(FORWARDS_AND_BACK[way](loss))(moving), jax.jit(jax.grad(loss))(moving), ROUNDING)
+    moving = {k: p[k] for k in ("transfer", "background", "voxels", "eye")}
+    loss = make_loss({k: v for k, v in p.items() if k not in moving}, jvr.Replay())
+    return loss, moving, jax.jit(jax.grad(loss))(moving)
 
 
 def test_modes_that_a_way_does_not_have_are_refused(x64):

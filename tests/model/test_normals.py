@@ -270,11 +270,16 @@ def _in_world(volume, normals, transfer, points):
 
 
 DEFAULT = [(jvr.PrecomputedGradient, True)]
+# Opacities of neighbours go into a gradient in one way, of which central differences are an example.
+OF_OPACITY = [(jvr.AnalyticGradient, True), (jvr.CentralDifferences, True), (jvr.PrecomputedGradient, True)]
 
 
 @pytest.mark.parametrize(
     ("scheme", "of_opacity"),
-    [pytest.param(s, o, marks=[] if (s, o) in DEFAULT else pytest.mark.slow) for s in SCHEMES for o in (False, True)],
+    [
+        pytest.param(s, o, marks=[] if (s, o) in DEFAULT else pytest.mark.slow)
+        for s, o in (*((s, False) for s in SCHEMES), *OF_OPACITY)
+    ],
 )
 def test_gradient_of_a_shaded_picture(scheme, of_opacity, x64):
     """In every voxel and every entry of the transfer function, against central differences."""
