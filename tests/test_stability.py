@@ -17,7 +17,7 @@ GRADIENT = 1e-3
 
 
 # Structures of scenes among the hard cases, each with programs of its own.
-STRUCTURES = 11
+STRUCTURES = 13
 
 
 @pytest.fixture(scope="module")
