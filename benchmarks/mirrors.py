@@ -14,7 +14,7 @@ from benchmarks import scenes
 from benchmarks.surfaces import SIZE, processor_seconds
 
 VOXELS = 128
-ORDERS = (1, 2, 3)
+ORDERS = (1, 2)
 
 
 def mirrors() -> dict[str, Any]:

@@ -237,6 +237,22 @@ def test_derivatives_match_differences(x64, opacity):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("adjoint", [jvr.Replay(), jvr.Rows(), jvr.Forward()], ids=["replay", "rows", "forward"])
+def test_every_adjoint_has_the_derivative_of_a_mirror(x64, adjoint):
+    """In its reflectance: what it mirrors less what it hides, through the fog in front of it."""
+    fog = jvr.LinearTransfer([-40.0, 40.0], np.full((2, 3), 0.3), np.full(2, 0.02))
+    scene = planes([2.75], [[0.9, 0.1, 0.2]], background=(0.2, 0.5, 0.7), transfer=fog, specular=jvr.Specular(0.6, order=1))
+    camera, settings = tilted(scene.volume, 0, size=1, extent=0.1), dataclasses.replace(SETTINGS, adjoint=adjoint)
+
+    def seen(w):
+        return jvr.render(eqx.tree_at(lambda s: s.specular.reflectance, scene, w), camera, settings).rgb[0, 0, 0]
+
+    slope = (jax.jacfwd if isinstance(adjoint, jvr.Forward) else jax.grad)(seen)
+    T = np.exp(-0.02 * (8 - 2.75))
+    np.testing.assert_allclose(jax.jit(slope)(jnp.asarray(0.6)), T * ((1 - T) * 0.3 + T * 0.2 - 0.9), rtol=1e-6)
+
+
+@pytest.mark.slow
 def test_extremes_are_finite():
     """Index 1, grazing rays, an eye inside a surface, a plateau at the isovalue, an opaque medium, a lamp: values and derivatives."""
     plateau = np.clip(-np.sum(np.square(np.indices((9, 9, 9)) - 4.0), axis=0), -9.0, -4.0)
