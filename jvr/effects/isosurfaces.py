@@ -8,9 +8,10 @@ from jaxtyping import Array, Bool, Float
 
 from jvr.effects.lighting import LitShader
 from jvr.effects.surface_shadows import SurfaceShadows
-from jvr.march.first_hit import FINER, Hits, Reached, Search, leaving, next_hit, start, steepest_of
+from jvr.march.first_hit import FINER, Hits, Reached, Search, leaving, next_hit, start
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.occupancy import occupancy_of_values
+from jvr.march.steepest import steepest_of
 from jvr.march.steps import Point, Rays, points_at
 from jvr.model.bricks import Bricks
 from jvr.model.effects import AbstractSurfaces
