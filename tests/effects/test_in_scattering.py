@@ -108,6 +108,7 @@ def test_it_is_that_of_brute_force(x64):
     np.testing.assert_allclose(found(one, p)[0, 0], expected, rtol=0.015)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences(x64):
     """Of table, voxels, lamp, lengths and bias, in both modes."""
     lamp = jvr.PointLight((3.1, 4.7, 6.2))
@@ -154,13 +155,14 @@ def test_what_is_computed_beforehand_is_kept(tmp_path):
     np.testing.assert_allclose(found(kept, p), found(one, p), atol=1e-6)
     assert eqx.tree_equal(jvr.precompute(one, cache=tmp_path, report=done.append), kept)
     assert done[1].cached
-    brighter = dataclasses.replace(kept, shadows=dataclasses.replace(kept.shadows.rebuilt(bias=0.5)))
+    brighter = dataclasses.replace(kept, shadows=kept.shadows.rebuilt(bias=0.5))
     assert brighter.shadows.stale(brighter) == ()
     other = dataclasses.replace(kept, lights=(jvr.DirectionalLight((1.0, 0.0, 0.0)),))
     with pytest.raises(ValueError, match=r"in-scattering was computed for another light.*replace shadows by shadows.pinned\(\)"):
         other.current()
 
 
+@pytest.mark.slow
 def test_pictures_of_hard_cases_are_finite():
     """Opaque and empty media, balls larger than the volume, light inside; and pictures show what is kept."""
     camera = perspective(small().volume, 4, 3)

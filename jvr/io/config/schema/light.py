@@ -98,8 +98,10 @@ def _one_method(value: Any) -> Any:
     if isinstance(value, list):
         methods = [table.get("kind") if isinstance(table, dict) else table for table in value]
     else:
-        methods = [k for k in (value if isinstance(value, dict) else ()) if k in KINDS[AbstractShadows]]
-        methods = [*filter(None, [value.get("kind")]), *methods] if methods else []
+        table = value if isinstance(value, dict) else {}
+        # Numbers are keys of a method: `rays` is a kind, and how many of them in-scattering has.
+        methods = [k for k, given in table.items() if k in KINDS[AbstractShadows] and not isinstance(given, int | float)]
+        methods = [*filter(None, [table.get("kind")]), *methods] if methods else []
     if len(methods) > 1:
         names = " and ".join(f"'{method}'" for method in methods)
         raise problem(f'{names} exclude each other: keep one of them, such as [shadows] kind = "{methods[0]}"')
