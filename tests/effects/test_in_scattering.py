@@ -72,6 +72,7 @@ def test_deep_in_a_homogeneous_medium_it_has_the_closed_form(sigma, x64):
     assert float(lit[0][0]) == pytest.approx(expected, rel=1e-3 + sigma**2 / 8)
 
 
+@pytest.mark.slow
 def test_a_ball_without_extent_leaves_direct_light():
     """At the nodes; and more than none of it is `bias`."""
     volume, p = jvr.Volume(voxels((5, 6, 4))), np.array([[1.0, 2, 3], [4, 0, 1], [2, 5, 0]])
@@ -85,6 +86,7 @@ def test_a_ball_without_extent_leaves_direct_light():
     np.testing.assert_allclose(biased, 0.25 + 0.75 * direct, rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_it_is_that_of_brute_force(x64):
     """Thousands of random directions, half a voxel apart, with exact shadow rays from every sample, in double precision."""
     n, radius, offset = 9, 3.0, 0.5

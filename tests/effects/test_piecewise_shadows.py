@@ -122,6 +122,7 @@ def test_near_shadows_are_sharper_than_those_of_a_shadow_volume_of_as_many_nodes
     assert errors[0] < 0.1 * errors[1], errors
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences(x64):
     """In both modes; of some voxels, of entries of the table, of where lights are."""
     lamp = jvr.PointLight((3.1, 9.7, 12.2))
@@ -148,6 +149,7 @@ def test_derivatives_are_those_of_differences(x64):
         assert float(forward) == pytest.approx(reverse, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_hard_cases_are_finite_and_right():
     """Opaque and empty media; a lamp on a node; volumes of one voxel; a clipping box with nodes outside of it."""
     solid = lambda sigma: jvr.LinearTransfer([0.0, 1.0], np.zeros((2, 3)), [sigma, sigma])
