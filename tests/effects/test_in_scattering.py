@@ -88,7 +88,8 @@ def test_a_ball_without_extent_leaves_direct_light():
 
 @pytest.mark.slow
 def test_it_is_that_of_brute_force(x64):
-    """Thousands of random directions, half a voxel apart, with exact shadow rays from every sample, in double precision."""
+    """Thousands of random directions, samples a fifth of a voxel apart in double precision, and light that is trilinear between the voxels.
+    (Without that it is 2 % less in this blob, which is as wide as four voxels.)"""
     n, radius, offset = 9, 3.0, 0.5
     x, y, z = np.meshgrid(*[np.linspace(-1, 1, n)] * 3, indexing="ij")
     values = np.exp(-4 * ((x - 0.2) ** 2 + y**2 + (z - 0.4) ** 2)) + 0.1
@@ -99,15 +100,17 @@ def test_it_is_that_of_brute_force(x64):
     directions = np.random.default_rng(5).normal(size=(3000, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     steps, up = 12, np.arange(0.1, n, 0.2)
+    nodes = np.stack(np.meshgrid(*[np.arange(float(n))] * 3, indexing="ij"), axis=-1)
+    above = nodes[..., None, :] + up[:, None] * np.array([0.0, 0, 1])
+    direct = np.exp(-0.2 * np.sum(np.where(inside(above), sigma(above), 0.0), axis=-1))
     p, expected = np.array([[4.0, 4, 2], [5, 3, 4], [2, 5, 6]]), []
     for at in p:
         s = offset + (radius - offset) * (np.arange(steps) + 0.5) / steps
         x = at + s[:, None] * directions[:, None]
         dtau = np.where(inside(x), sigma(x), 0.0) * (radius - offset) / steps
-        above = np.clip(x, 0, n - 1)[..., None, :] + up[:, None] * np.array([0.0, 0, 1])
-        light = np.exp(-0.2 * np.sum(np.where(inside(above), sigma(above), 0.0), axis=-1))
+        light = map_coordinates(direct, np.moveaxis(np.clip(x, 0, n - 1), -1, 0), order=1)
         expected.append(np.mean(light * np.exp(-(np.cumsum(dtau, axis=1) - 0.5 * dtau))))
-    np.testing.assert_allclose(found(one, p)[0, 0], expected, rtol=0.015)
+    np.testing.assert_allclose(found(one, p)[0, 0], expected, rtol=0.01)
 
 
 @pytest.mark.slow
