@@ -20,6 +20,7 @@ import jvr
 from benchmarks import scenes, yardsticks
 from benchmarks.light import light
 from benchmarks.mirrors import mirrors
+from benchmarks.occlusion import occlusion
 from benchmarks.poses import pose_step
 from benchmarks.preparation import preparation
 from benchmarks.surface_peers import surface_peers
@@ -259,6 +260,7 @@ CASES = {
     "light": light,
     "mirrors": mirrors,
     "surfaces": surfaces,
+    "occlusion": occlusion,
     "surface_peers": surface_peers,
     "fitting": fitting,
     "startup": startup,

@@ -8,9 +8,9 @@ from jvr.names import NAMES
 if TYPE_CHECKING:
     from jvr.effects.deep_shadow_map import DeepShadowMap as DeepShadowMap
     from jvr.effects.histogram_occlusion import HistogramOcclusion as HistogramOcclusion
-    from jvr.effects.histogram_occlusion import LocalHistograms as LocalHistograms
     from jvr.effects.in_scattering import InScattering as InScattering
     from jvr.effects.isosurfaces import Isosurfaces as Isosurfaces
+    from jvr.effects.local_histograms import LocalHistograms as LocalHistograms
     from jvr.effects.occlusion import LocalOcclusion as LocalOcclusion
     from jvr.effects.phenomenological import PhenomenologicalBSDF as PhenomenologicalBSDF
     from jvr.effects.piecewise_shadows import PiecewiseShadows as PiecewiseShadows
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from jvr.effects.shadow_volume import OpacityShadowMap as OpacityShadowMap
     from jvr.effects.shadow_volume import ShadowVolume as ShadowVolume
     from jvr.effects.specular import Specular as Specular
+    from jvr.effects.surface_occlusion import SurfaceOcclusion as SurfaceOcclusion
     from jvr.execution.devices import use_all_cores as use_all_cores
     from jvr.fitting.bijectors import Bounded as Bounded
     from jvr.fitting.bijectors import Identity as Identity

@@ -26,8 +26,9 @@ class Renamed:
 
 NAMES = {
     "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
-    "jvr.effects.histogram_occlusion": ("HistogramOcclusion", "LocalHistograms"),
+    "jvr.effects.histogram_occlusion": ("HistogramOcclusion",),
     "jvr.effects.in_scattering": ("InScattering",),
+    "jvr.effects.local_histograms": ("LocalHistograms",),
     "jvr.effects.occlusion": ("LocalOcclusion",),
     "jvr.effects.isosurfaces": ("Isosurfaces",),
     "jvr.effects.phenomenological": ("PhenomenologicalBSDF",),
@@ -38,6 +39,7 @@ NAMES = {
     "jvr.effects.shading": ("BlinnPhong", "Lambert", "Phong"),
     "jvr.effects.shadow_map": ("ShadowMap",),
     "jvr.effects.shadow_rays": ("ShadowRays",),
+    "jvr.effects.surface_occlusion": ("SurfaceOcclusion",),
     "jvr.effects.shadow_volume": ("OpacityShadowMap", "ShadowVolume"),
     "jvr.execution.devices": ("use_all_cores",),
     "jvr.fitting.grids": ("fit_on_grids",),

@@ -8,102 +8,105 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, UInt32
+import numpy as np
+from jaxtyping import Array, Float, UInt16
 
-from jvr.effects.nodes import AbstractProjection
-from jvr.effects.occlusion import OcclusionVisibility, occlusion_visibility
-from jvr.effects.short_rays import Reach, fractions_inside, short_rays
+from jvr.effects.local_histograms import (
+    Bins,
+    LocalHistograms,
+    Tree,
+    features_of,
+    grown,
+    mean_histograms,
+    ray_samples,
+    shell_of,
+)
+from jvr.effects.nodes import CHUNK, AbstractProjection
+from jvr.effects.occlusion import OcclusionVisibility, darkness_at_voxels, nodes_along, occlusion_visibility, resolutions
+from jvr.effects.short_rays import Reach, short_rays
 from jvr.march.medium import DENSEST, LightPath, Medium
-from jvr.march.secondary import take_midpoint
 from jvr.model.clipping import Clipping
-from jvr.model.effects import AbstractOcclusion, stale_message
-from jvr.model.grids import Shape, node_shape
+from jvr.model.effects import AbstractNodeOcclusion, stale_message
+from jvr.model.grids import Shape, node_positions
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import Knob, multiples
 from jvr.model.ranges import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL, Interval
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
-from jvr.numerics import divide_or_zero, mean_transmittance
+from jvr.numerics import divide_or_zero, mean_transmittance, one_minus_exp
 from jvr.types import ArrayLike, Scalar
 
 # Scalars at which the transfer function is looked at on either side of each bin.
 LOOKS = 8
-# Size of a grain where a scene says none, in voxels of the smallest spacing: that of the least error on the scenes of
-# `experiments/occlusion_accuracy.py`.
-GRAIN = 2.0
+# Nodes at most whose rays the clusters are made of.
+TAUGHT = 4096
+# Levels of the tree beyond those that halves of equal size would take.
+SPARE = 4
 
 
-class LocalHistograms(eqx.Module):
-    """Histograms of the scalars around the nodes of a grid, as `jvr.precompute` makes them of a `jvr.HistogramOcclusion`.
+class HistogramOcclusion(AbstractNodeOcclusion):
+    """Dynamic ambient occlusion: as `jvr.LocalOcclusion`, from histograms of the scalars around a point, whatever the transfer function
+    makes of them.
 
-    - `weights`: `(x, y, z, bins)`: how much of the ball around a node has the scalar of a bin, points weighted with `1 / d^2` of their
-      distance `d`, so that all distances count alike (notes, equation 6.7); a scalar between two bins counts in both, by how near it is.
-      Their sum is 1, less what lies outside of the volume or has no data.
-    - `positions`: `(bins,)`: the scalars of the bins.
-    - `length`: from where the ball begins to where it ends, in the world.
-    - `cache_key`: checksums of what they were made of (`jvr.model.kept.content`).
-    - `pinned`: whether they stay as they are although the volume is another.
-    """
+    Each of `K` rays of a point is cut into shells, of each of which a histogram `H` is known. What a transfer function makes of it is
+    homogeneous within a shell, and marched from the inside out:
 
-    weights: Float[Array, "x y z bins"]
-    positions: Float[Array, "bins"]
-    length: Scalar
-    cache_key: UInt32[Array, "parts 2"]
-    pinned: bool = eqx.field(static=True, default=False)
+        I(x) = 1 / K sum_k sum_i D_i / (R - a) exp(-sum_(j<i) D_j sigma_kj) phi1(D_i sigma_ki),
+        sigma_ki = sum_b H_kib(x) sigma_t(s_b),    phi1(d) = (1 - exp(-d)) / d,
 
+    with the length `D_i` of a shell. It is exact where no shell has more than one scalar in it; what lies in front of what within one
+    shell is not known. (One histogram of the whole ball, as the paper has it, does not know that of any two points.) Ambient
+    light is multiplied with `(bias + (1 - bias) I)^gamma`.
 
-class HistogramOcclusion(AbstractOcclusion):
-    """Dynamic ambient occlusion: as `jvr.LocalOcclusion`, from the histogram of the scalars in a ball around a point, whatever the transfer
-    function makes of them.
+    Of all rays of all nodes `clusters` are kept, the means of those that are alike in the mean and the spread of the scalars of each shell:
+    their histograms take `4 clusters x shells x bins` bytes, and each node one number of two bytes a ray. A new transfer function is one
+    product of the histograms with a vector, a sum over the shells of each cluster, and one over the rays of each node.
 
-        I(x) = phi1((R - a) sum_k H_k(x) rho_k),    rho_k = (1 - exp(-sigma_t(s_k) g)) / g,    phi1(d) = (1 - exp(-d)) / d,
+    With a `bleeding` the medium that is near sends on a part of the light that it takes, in its own colour: to `I` is added, in each
+    colour, `bleeding` times what each shell takes times the mean of `rgb` in it, with the weights `H sigma_t`.
 
-    the mean transmittance of a ball in which grains of `g` across lie at random, each with one scalar `s_k` of the histogram `H(x)`: exact
-    where the ball is homogeneous and not opaque within a grain. What stands in front of what histograms do not know: the wall of a large
-    opaque body shades more than it should, and a sheet that is thinner than a grain as well. Ambient light is multiplied with
-    `(bias + (1 - bias) I)^gamma`.
+    **Arguments:** `bins`: of a histogram, equally spaced between the least and the largest voxel, at least 2; `shells`: parts of a ray,
+    at most as many as `samples`; `clusters`: at most 65536, rounded up to a power of two; `rays`, `radius`, `offset`, `samples`,
+    `resolution`, `bias`, `gamma`: as of `jvr.LocalOcclusion`; `bleeding`: 0 ... 1, or `None`.
 
-    With a `bleeding` the medium that is near sends on a part of the light that it takes, in its own colour, the mean of `rgb_k` with the
-    weights `H_k rho_k`: `I + bleeding (1 - I) rgb` in each colour.
-
-    **Arguments:** `bins`: of a histogram, equally spaced between the least and the largest voxel, at least 2; `rays`, `radius`, `offset`,
-    `samples`, `resolution`, `bias`, `gamma`: as of `jvr.LocalOcclusion`; `grain`: `g`, a world length, by default twice the smallest
-    spacing; `bleeding`: 0 ... 1, or `None`.
-
-    Differentiable in transfer function, `bias`, `gamma`, `grain` and `bleeding`, and where histograms are not computed beforehand in
-    voxels, `radius` and `offset`; detached: where bins lie. `jvr.precompute(scene)` keeps them: they are those of volume and clipping box,
-    and a new transfer function costs a product of a matrix and a vector, `bins` numbers for each node. **Raises** `ValueError` for numbers
-    outside their ranges, and for a transfer function that takes the gradient, of which histograms know nothing.
+    Differentiable in transfer function, `bias`, `gamma` and `bleeding`; detached: voxels, `radius`, `offset`, which
+    `jvr.LocalOcclusion` has derivatives in. `jvr.precompute(scene)` keeps the histograms: they are those of volume and clipping box.
+    **Raises** `ValueError` for numbers outside their ranges, and for a transfer function that takes the gradient, of which histograms know
+    nothing.
     """
 
     bins: int = choice(Interval(low=2.0), doc="of each histogram", most=1024)
     rays: int = choice(AT_LEAST_ONE, doc="rays for each node")
+    shells: int = choice(AT_LEAST_ONE, doc="histograms along each ray", most=64)
+    clusters: int = choice(Interval(1, 65536), doc="different rays that are kept")
     radius: Scalar | None = parameter(NOT_NEGATIVE, doc="of the ball around a point", unit="mm")
     offset: Scalar | None = parameter(NOT_NEGATIVE, doc="how far from a point the ball begins", unit="mm")
     samples: int = choice(AT_LEAST_ONE, doc="along each ray")
-    resolution: float = choice(Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start")
+    resolution: float | None = choice(
+        Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start"
+    )
     bias: Scalar = parameter(UNIT_INTERVAL, doc="share of ambient light that nothing takes away")
     gamma: Scalar | None = parameter(POSITIVE, doc="exponent of what is left of ambient light")
-    grain: Scalar | None = parameter(POSITIVE, doc="size of what is opaque", unit="mm")
     bleeding: Scalar | None = parameter(UNIT_INTERVAL, doc="share of the light that what is near sends on")
     projected: LocalHistograms | None = parameter(doc="what has been computed beforehand")
 
     def __init__(
         self,
-        bins: int = 32,
+        bins: int = 64,
         rays: int = 32,
         *,
+        shells: int = 8,
+        clusters: int = 2**14,
         radius: ArrayLike | None = None,
         offset: ArrayLike | None = None,
         samples: int = 16,
-        resolution: float | int = 0.5,
+        resolution: float | int | None = None,
         bias: ArrayLike = 0.0,
         gamma: ArrayLike | None = None,
-        grain: ArrayLike | None = None,
         bleeding: ArrayLike | None = None,
     ):
-        assign(self, bins=bins, rays=rays, radius=radius, offset=offset, samples=samples, resolution=resolution)
-        assign(self, bias=bias, gamma=gamma, grain=grain, bleeding=bleeding)
+        assign(self, bins=bins, rays=rays, shells=shells, clusters=clusters, radius=radius, offset=offset, samples=samples)
+        assign(self, resolution=resolution, bias=bias, gamma=gamma, bleeding=bleeding)
         self.projected = None
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
@@ -112,9 +115,15 @@ class HistogramOcclusion(AbstractOcclusion):
         return (
             multiples("bins", self.bins, (1 / 2, 1), 4, least=2),
             multiples("rays", self.rays, (1 / 2, 1), 4, least=1),
+            multiples("shells", self.shells, (1 / 2, 1), 2, least=1, most=64),
+            multiples("clusters", self.clusters, (1 / 4, 1), 4, least=1, most=65536),
             multiples("samples", self.samples, (1 / 2, 1), 2, least=1),
-            multiples("resolution", self.resolution, (1 / 2, 1), 2, most=1.0),
+            resolutions(self, scene.volume),
         )
+
+    @property
+    def reads_transfer(self) -> bool:
+        return True
 
     @property
     def stale_message(self) -> str:
@@ -130,95 +139,101 @@ class HistogramOcclusion(AbstractOcclusion):
             raise ValueError("histograms know nothing of gradients, which the transfer function takes: use jvr.LocalOcclusion")
         # Whatever the transfer function makes visible.
         medium = path(False)._replace(occupancy=None)
-        return HistogramProjection(
-            volume=scene.volume,
-            clipping=scene.clipping,
-            medium=medium,
-            reach=Reach.of(self, scene.volume),
-            scalars=_positions(self.bins, scene.volume),
-            rays=self.rays,
-            resolution=self.resolution,
-        )
+        return HistogramProjection.of(self, scene, medium)
 
-    def finished(self, scene: Scene, *nodes: Any) -> LocalHistograms:
-        (weights,) = nodes
-        weights = weights.reshape(*node_shape(scene.volume, self.resolution), -1)
-        positions, length = _positions(self.bins, scene.volume), Reach.of(self, scene.volume).length
-        return LocalHistograms(weights, positions, length, jnp.asarray(self.cache_key(scene)))
+    def finished(self, scene: Scene, projection: "HistogramProjection", *nodes: Any) -> LocalHistograms:
+        codes = nodes[0].reshape(*projection.shape, -1)
+        reach, samples = projection.reach, self.samples
+        shells = np.bincount(shell_of(samples, self.shells)) / samples
+        extents = reach.length * (1 - reach.beyond) * jnp.asarray(shells, reach.ends.dtype)
+        key = jnp.asarray(self.cache_key(scene))
+        return LocalHistograms(projection.weights, codes, projection.bins.positions, extents, reach.beyond, key)
 
     def visibility(self, scene: Scene, path: LightPath) -> OcclusionVisibility:
         histograms = self.projected
         if histograms is None:
-            histograms = self.finished(scene, *self.projection(scene, path).all_nodes())
-        return occlusion_visibility(self, scene.volume, self._taken(scene, histograms))
+            projection = self.projection(scene, path)
+            histograms = self.finished(scene, projection, *projection.all_nodes())
+        taken = jnp.take(self._taken_by_clusters(scene, histograms), histograms.codes.astype(jnp.int32), axis=0)
+        return occlusion_visibility(self, scene.volume, darkness_at_voxels(jnp.mean(taken, axis=3), scene.volume))
 
-    def _taken(self, scene: Scene, histograms: LocalHistograms) -> Float[Array, "x y z channels"]:
-        """What nodes take away of ambient light, by the transfer function of a scene."""
-        # Each bin as its own hat sees the transfer function.
-        positions, at = histograms.positions, (jnp.arange(2 * LOOKS + 1, dtype=histograms.positions.dtype) - LOOKS) / (LOOKS + 1)
-        hat = (1 - jnp.abs(at)) / jnp.sum(1 - jnp.abs(at))
-        scalars = jnp.clip(positions[:, None] + at * (positions[1] - positions[0]), positions[0], positions[-1])
-        classified = jax.vmap(jax.vmap(scene.transfer.evaluate))(scalars)
-        rgb, sigma_t = classified.rgb, classified.sigma_t
-        grain = GRAIN * jnp.min(scene.volume.spacing) if self.grain is None else self.grain
-        # The mean extinction of a grain: so much of it as it takes of what goes through it.
-        rho = [sigma * mean_transmittance(sigma * grain) for sigma in (jnp.minimum(s, DENSEST / grain) for s in sigma_t)]
-        channels = [r @ hat for r in rho]
-        coloured = [] if self.bleeding is None else [(r * c) @ hat for r, c in zip(rho * (3 // len(rho)), rgb, strict=True)]
-        found = jnp.moveaxis(histograms.weights @ jnp.stack(channels + coloured, axis=-1), -1, 0)
-        extinction = list(found[: len(channels)])
-        taken = [1 - mean_transmittance(histograms.length * mean) for mean in extinction]
+    def _taken_by_clusters(self, scene: Scene, histograms: LocalHistograms) -> Float[Array, "clusters channels"]:
+        """What rays take away of ambient light, by the transfer function of a scene."""
+        rgb, sigma_t = _in_bins(scene, histograms.positions)
+        # Not in fewer digits, as accelerators would: what is transparent has to stay so.
+        mean = lambda of_bins: jnp.einsum("csb,b->sc", histograms.weights, of_bins, precision=jax.lax.Precision.HIGHEST)
+        extinctions = [mean(sigma) for sigma in sigma_t]
+        taken = [_taken_by_shells(extinction, histograms) for extinction in extinctions]
         if self.bleeding is not None:
-            colours = zip(taken * (3 // len(taken)), extinction * (3 // len(extinction)), found[len(channels) :], strict=True)
-            taken = [t * (1 - self.bleeding * divide_or_zero(c, mean)) for t, mean, c in colours]
-        return jnp.stack(taken, axis=-1)
+            of_rgb = lambda channels: channels * (3 // len(channels))
+            colours = zip(rgb, of_rgb(sigma_t), of_rgb(extinctions), of_rgb(taken), strict=True)
+            taken = [t * (1 - self.bleeding * divide_or_zero(mean(s * c), whole)) for c, s, whole, t in colours]
+        return jnp.stack([jnp.sum(t, axis=0) for t in taken], axis=-1)
+
+
+def _in_bins(scene: Scene, positions: Float[Array, "bins"]) -> tuple[list[Array], list[Array]]:
+    """Colour and extinction of each bin, as its own hat sees the transfer function."""
+    at = (jnp.arange(2 * LOOKS + 1, dtype=positions.dtype) - LOOKS) / (LOOKS + 1)
+    hat = (1 - jnp.abs(at)) / jnp.sum(1 - jnp.abs(at))
+    scalars = jnp.clip(positions[:, None] + at * (positions[1] - positions[0]), positions[0], positions[-1])
+    classified = jax.vmap(jax.vmap(scene.transfer.evaluate))(scalars)
+    densest = DENSEST / jnp.min(scene.volume.spacing)
+    sigma_t = [jnp.minimum(sigma, densest) for sigma in classified.sigma_t]
+    extinctions = [sigma @ hat for sigma in sigma_t]
+    # Of what is in a bin, colours count by how dense it is.
+    weighted = zip(sigma_t * (3 // len(sigma_t)), classified.rgb, extinctions * (3 // len(sigma_t)), strict=True)
+    return [divide_or_zero((sigma * colour) @ hat, whole) for sigma, colour, whole in weighted], extinctions
+
+
+def _taken_by_shells(sigma_t: Float[Array, "shells clusters"], histograms: LocalHistograms) -> Float[Array, "shells clusters"]:
+    """What each shell of a ray takes of the light that it would bring: what of it is scattered in the shell, and all from behind it."""
+    extents = histograms.extents
+    share = (1 - histograms.beyond) * divide_or_zero(extents, jnp.full_like(extents, jnp.sum(extents)))
+    behind = 1 - jnp.cumsum(share)
+    tau = sigma_t * extents[:, None]
+    before = jnp.exp(-(jnp.cumsum(tau, axis=0) - tau))
+    return before * (behind[:, None] * one_minus_exp(tau) + share[:, None] * (1 - mean_transmittance(tau)))
 
 
 class HistogramProjection(AbstractProjection):
-    """All that the histograms of a scene are made with, `rays` rays from each node. `scalars`: of the bins."""
+    """All that the histograms of a scene are made with. `weights`: those of the clusters that the `tree` tells apart."""
 
     volume: Volume
     clipping: Clipping
     medium: Medium
     reach: Reach
-    scalars: Float[Array, "bins"]
+    bins: Bins
+    tree: Tree
+    weights: Float[Array, "clusters shells bins"]
     rays: int = eqx.field(static=True)
-    resolution: float = eqx.field(static=True)
+    shells: int = eqx.field(static=True)
+    nodes_along: Shape = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, occlusion: HistogramOcclusion, scene: Scene, medium: Medium) -> "HistogramProjection":
+        """With clusters of the rays of some of the nodes."""
+        shape = nodes_along(occlusion.resolution, scene.volume)
+        volume, clipping, medium, reach = jax.lax.stop_gradient(
+            (scene.volume, scene.clipping, medium, Reach.of(occlusion, scene.volume))
+        )
+        bins = Bins.of(occlusion.bins, volume)
+        positions = node_positions(volume, shape)
+        some = np.random.default_rng(0).permutation(len(positions))[:TAUGHT]
+        samples = lambda p: ray_samples(volume, bins, short_rays(volume, clipping, occlusion.rays, p), reach)
+        chunks = jnp.asarray(np.resize(positions[some], (-(-len(some) // CHUNK), min(CHUNK, len(some)), 3)))
+        taught = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0).reshape(x.shape[1], -1), jax.lax.map(samples, chunks))
+        features = features_of(taught, occlusion.shells)
+        # Halves are not equal, so that it takes a few more to tell few rays apart.
+        levels = min((occlusion.clusters - 1).bit_length(), features.shape[0].bit_length() + SPARE)
+        tree = grown(features, levels)
+        weights = mean_histograms(taught, tree.find(features), 2**levels, occlusion.shells, occlusion.bins)
+        return cls(volume, clipping, medium, reach, bins, tree, weights, occlusion.rays, occlusion.shells, shape)
 
     @property
     def shape(self) -> Shape:
-        return node_shape(self.volume, self.resolution)
+        return self.nodes_along
 
-    def project(self, p: Float[Array, "nodes 3"]) -> tuple[Float[Array, "nodes bins"]]:
-        """Histograms around grid positions."""
-        rays, bins = short_rays(self.volume, self.clipping, self.rays, p), self.scalars.shape[0]
-        ends = self.reach.ends
-        first, last = self.scalars[0], self.scalars[-1]
-        node = jnp.repeat(jnp.arange(p.shape[0]), self.rays)
-
-        def step(total: Float[Array, "nodes bins"], ends: tuple[Scalar, Scalar]) -> tuple[Float[Array, "nodes bins"], None]:
-            _, _, sample = take_midpoint(self.medium, self.volume, rays, *ends, True)
-            share = fractions_inside(rays, *ends)[1]
-            for known in sample.known:
-                share = jnp.where(known > 0.5, share, 0.0)
-            # A volume of one value has all of it in its first bin.
-            wide = last > first
-            place = jnp.where(wide, (sample.s - first) / jnp.where(wide, last - first, 1.0), 0.0) * (bins - 1)
-            place = jnp.clip(jnp.where(share > 0, place, 0.0), 0.0, bins - 1)
-            low = jnp.clip(jax.lax.stop_gradient(jnp.floor(place)), 0, bins - 2)
-            index, fraction = low.astype(jnp.int32), place - low
-            total = total.at[node, index].add(share * (1 - fraction)).at[node, index + 1].add(share * fraction)
-            return total, None
-
-        zero = jnp.zeros((p.shape[0], bins), self.scalars.dtype)
-        total, _ = jax.lax.scan(jax.checkpoint(step), zero, (ends[:-1], ends[1:]))
-        return (total * (1 - self.reach.beyond) / (self.rays * (ends.shape[0] - 1)),)
-
-
-def _positions(bins: int, volume: Volume) -> Float[Array, "bins"]:
-    """Scalars of bins, from the least to the largest of a volume."""
-    voxels = jax.lax.stop_gradient(volume.values).astype(volume.slope.dtype)
-    there = jnp.isfinite(voxels)
-    ends = jnp.min(jnp.where(there, voxels, jnp.inf)), jnp.max(jnp.where(there, voxels, -jnp.inf))
-    ends = [jnp.where(jnp.any(there), end, 0.0) * volume.slope + volume.intercept for end in ends]
-    return jnp.linspace(jnp.minimum(*ends), jnp.maximum(*ends), bins)
+    def project(self, p: Float[Array, "nodes 3"]) -> tuple[UInt16[Array, "nodes rays"]]:
+        """The clusters of rays from grid positions."""
+        samples = ray_samples(self.volume, self.bins, short_rays(self.volume, self.clipping, self.rays, p), self.reach)
+        return (self.tree.find(features_of(samples, self.shells)).reshape(p.shape[0], -1).astype(jnp.uint16),)

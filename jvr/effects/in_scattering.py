@@ -139,7 +139,7 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
             resolution=self.resolution,
         )
 
-    def finished(self, scene: Scene, *nodes: Any) -> ProjectedInScattering:
+    def finished(self, scene: Scene, projection: Any, *nodes: Any) -> ProjectedInScattering:
         return ProjectedInScattering(self._taken(scene.volume, *nodes), jnp.asarray(self.cache_key(scene)))
 
     def visibility(self, scene: Scene, path: LightPath) -> "InScatteringVisibility":

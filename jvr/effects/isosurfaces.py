@@ -12,7 +12,7 @@ from jvr.march.first_hit import FINER, Hits, Reached, Search, leaving, next_hit,
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.occupancy import occupancy_of_values
 from jvr.march.steepest import steepest_of
-from jvr.march.steps import Point, Rays, points_at
+from jvr.march.steps import OnSurface, Point, Rays, points_at
 from jvr.model.bricks import Bricks
 from jvr.model.effects import AbstractSurfaces
 from jvr.model.parameters import assign, choice, parameter
@@ -32,7 +32,8 @@ class Isosurfaces(AbstractSurfaces):
 
     Without lights and shading a surface shows its `rgb`; with them it is shaded by the scene's `shading` or `material`, with the normal of
     its `normals`, and lies in its shadows. In a scene with `shadows` surfaces cast them on the medium and on each other, whichever method
-    finds those of the medium: a ray from each point to each light. They take no ambient and no environment light from anything.
+    finds those of the medium: a ray from each point to each light. They take ambient light from each other by `jvr.SurfaceOcclusion`
+    alone, and no environment light from anything.
 
     **Arguments:**
 
@@ -130,7 +131,7 @@ class Isosurfaces(AbstractSurfaces):
         opacity = hits.found.astype(rays.length.dtype) if self.opacity is None else own(self.opacity)
         shader = medium.shader
         if isinstance(shader, LitShader) and (shader.shading is not None or shader.environment is not None):
-            colour = _lit(shader, medium, rays, hits, colour)
+            colour = _lit(shader, medium, rays, hits, colour, self.values[hits.surface])
         return colour, opacity
 
     def shadowed(self, prepared: Search, scene: Scene, visible: AbstractVisibility | None) -> AbstractVisibility | None:
@@ -147,8 +148,8 @@ def hit_points(rays: Rays, hits: Hits) -> Point:
     return points_at(still, jnp.arange(zero.size, dtype=jnp.int32), zero, hits.u)
 
 
-def _lit(shader: LitShader, medium: Medium, rays: Rays, hits: Hits, colour: Triple) -> Triple:
-    """What surfaces of a colour reflect."""
+def _lit(shader: LitShader, medium: Medium, rays: Rays, hits: Hits, colour: Triple, value: Float[Array, "rays"]) -> Triple:
+    """What surfaces of a colour reflect, with the isovalue of each."""
     # A surface does not scatter as a medium does, and where it is cut there is none of it.
     shader = LitShader(
         shader.optical, shader.frame, shader.world_from_grid, shader.lights, shader.shading, None, None, shader.environment
@@ -156,9 +157,10 @@ def _lit(shader: LitShader, medium: Medium, rays: Rays, hits: Hits, colour: Trip
     there = lambda x: jnp.where(hits.found, x, 0.0)
     point = hit_points(rays, hits)
     sample = jax.vmap(medium.field.resample)(point)
-    if medium.visibility is not None:
-        sample = sample._replace(light=medium.visibility.transmittances(point, hits.found, reverse=True))
     sample = jax.vmap(shader.in_world, in_axes=(None, 0, 0))(medium.transfer, sample, point)
+    if medium.visibility is not None:
+        where = point._replace(surface=OnSurface(value, sample.gradient)) if sample.gradient else point
+        sample = sample._replace(light=medium.visibility.transmittances(where, hits.found, reverse=True))
     classified = Classified(colour, (jnp.zeros_like(hits.u),))
     none = jnp.zeros((), hits.u.dtype)
     light_at = lambda sample, point, classified: shader.light_at(sample, point, classified, none, is_surface=True)

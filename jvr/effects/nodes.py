@@ -88,7 +88,7 @@ def project_all(projection: AbstractProjection, active: Bool[Array, "nodes"]) ->
         def chunk(inputs: tuple[Array, Array]) -> Any:
             p, busy = inputs
             found = jax.lax.cond(jnp.any(busy), lambda p: projection.project(p), lambda p: blank, p)
-            return jax.tree.map(lambda x: jnp.where(busy.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0), found)
+            return jax.tree.map(lambda x: jnp.where(busy.reshape(-1, *(1,) * (x.ndim - 1)), x, jnp.zeros_like(x)), found)
 
         return jax.lax.map(chunk, inputs)
 

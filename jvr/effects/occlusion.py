@@ -3,6 +3,7 @@ occlusion in direct volume rendering", IEEE TVCG 16(4), 2010; course notes on GP
 section 6.1).
 """
 
+import math
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -16,31 +17,37 @@ from jvr.effects.short_rays import Reach, mean_light, short_rays, sources_of_ray
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Transmittances
 from jvr.model.clipping import Clipping
-from jvr.model.effects import AbstractOcclusion, stale_message
-from jvr.model.grids import Shape, fractions_at_voxels, node_shape, nodes_for_each_voxel
+from jvr.model.effects import AbstractNodeOcclusion, stale_message
+from jvr.model.grids import Shape, node_shape, nodes_for_each_voxel, resampled_cubic
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import Knob, multiples
 from jvr.model.ranges import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL, Interval
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
+from jvr.numerics import larger
 from jvr.types import ArrayLike, Scalar
+
+# Voxels at most of which each is a node where a scene says no resolution.
+NODES = 2**19
+# What is left of ambient light where all of it is taken, for the sake of derivatives.
+DARKEST = 1e-6
 
 
 class ProjectedOcclusion(eqx.Module):
     """Occlusion as it was computed, on the grid of the voxels.
 
-    - `taken`: `(x, y, z, 1)`, or `(x, y, z, 3)` for coloured extinction: `1 - I`, which is also 0 where nothing is visible and nothing was
-      computed.
+    - `darkness`: `(x, y, z, 1)`, or `(x, y, z, 3)` for coloured extinction: `1 - sqrt(I)`, which is also 0 where nothing is visible and
+      nothing was computed.
     - `cache_key`: checksums of what it was made of (`jvr.model.kept.content`).
     - `pinned`: whether it stays as it is although the scene is another.
     """
 
-    taken: Float[Array, "x y z channels"]
+    darkness: Float[Array, "x y z channels"]
     cache_key: UInt32[Array, "parts 2"]
     pinned: bool = eqx.field(static=True, default=False)
 
 
-class LocalOcclusion(AbstractOcclusion):
+class LocalOcclusion(AbstractNodeOcclusion):
     """Local ambient occlusion: the mean over directions of the light that is scattered to a point from within a ball around it.
 
         I(x) = 1 / K sum_k 1 / (R - a) integral_a^R exp(-integral_a^s sigma_t du) ds        (notes, equations 6.1 and 6.3)
@@ -54,7 +61,8 @@ class LocalOcclusion(AbstractOcclusion):
     radiance that arrives where `glow = (R - a) / L` under ambient radiance `L`, of which it is a multiple: without ambient light nothing
     glows.
 
-    `I` is found at the nodes of a grid near which something is visible, by cubic convolution at the voxels, and is trilinear in between.
+    `I` is found at the nodes of a grid near which something is visible, by cubic convolution at the voxels, and its root is trilinear in
+    between: `I` falls into what is opaque ever more slowly, and straight lines between its values let light in.
     Along a ray extinction is constant in each of `samples` segments, whose integral is exact: what is homogeneous has no error of the
     quadrature.
 
@@ -64,7 +72,8 @@ class LocalOcclusion(AbstractOcclusion):
     - `radius`, `offset`: `R` and `a`, world lengths, not negative; by default 16 and 1 times the smallest spacing. With `radius` no larger
       than `offset` nothing is occluded, which is the limit of ever smaller balls.
     - `samples`: segments along each ray.
-    - `resolution`: nodes for each voxel along an axis, above 0 and at most 1.
+    - `resolution`: nodes for each voxel along an axis, above 0 and at most 1. `None`: 1 in volumes of at most 2^19 voxels, which may be few
+      across what is in them, and 0.5 in others.
     - `bias`: 0 ... 1; `gamma`: positive, or `None` for 1.
     - `glow`: not negative, or `None` where nothing does.
 
@@ -78,7 +87,9 @@ class LocalOcclusion(AbstractOcclusion):
     radius: Scalar | None = parameter(NOT_NEGATIVE, doc="of the ball that rays see", unit="mm")
     offset: Scalar | None = parameter(NOT_NEGATIVE, doc="how far from a point its rays begin", unit="mm")
     samples: int = choice(AT_LEAST_ONE, doc="segments along each ray")
-    resolution: float = choice(Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start")
+    resolution: float | None = choice(
+        Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start"
+    )
     bias: Scalar = parameter(UNIT_INTERVAL, doc="share of ambient light that nothing takes away")
     gamma: Scalar | None = parameter(POSITIVE, doc="exponent of what is left of ambient light")
     glow: Scalar | None = parameter(
@@ -93,7 +104,7 @@ class LocalOcclusion(AbstractOcclusion):
         radius: ArrayLike | None = None,
         offset: ArrayLike | None = None,
         samples: int = 16,
-        resolution: float | int = 0.5,
+        resolution: float | int | None = None,
         bias: ArrayLike = 0.0,
         gamma: ArrayLike | None = None,
         glow: ArrayLike | None = None,
@@ -109,7 +120,7 @@ class LocalOcclusion(AbstractOcclusion):
         return (
             multiples("rays", self.rays, (1 / 4, 1 / 2, 1), 4, least=1),
             multiples("samples", self.samples, (1 / 4, 1 / 2, 1), 2, least=1),
-            multiples("resolution", self.resolution, (1 / 2, 1), 2, most=1.0),
+            resolutions(self, scene.volume),
         )
 
     @property
@@ -129,24 +140,25 @@ class LocalOcclusion(AbstractOcclusion):
             reach=Reach.of(self, scene.volume),
             glow=self.glow,
             rays=self.rays,
-            resolution=self.resolution,
+            nodes_along=nodes_along(self.resolution, scene.volume),
         )
 
-    def finished(self, scene: Scene, *nodes: Any) -> ProjectedOcclusion:
-        return ProjectedOcclusion(self._taken(scene.volume, *nodes), jnp.asarray(self.cache_key(scene)))
+    def finished(self, scene: Scene, projection: "OcclusionProjection", *nodes: Any) -> ProjectedOcclusion:
+        coarse = nodes[0].reshape(*projection.shape, -1)
+        # What glows may bring more light than there was.
+        least = 0.0 if self.glow is None else -jnp.inf
+        return ProjectedOcclusion(darkness_at_voxels(coarse, scene.volume, least), jnp.asarray(self.cache_key(scene)))
 
     def visibility(self, scene: Scene, path: LightPath) -> "OcclusionVisibility":
         kept = self.projected
-        taken = self._taken(scene.volume, *visible_nodes(self.projection(scene, path))) if kept is None else kept.taken
-        return occlusion_visibility(self, scene.volume, taken)
-
-    def _taken(self, volume: Volume, nodes: Float[Array, "nodes channels"]) -> Float[Array, "x y z channels"]:
-        """What all nodes take of ambient light, on the grid of the voxels."""
-        return fractions_at_voxels(volume, nodes, self.resolution, least=0.0 if self.glow is None else -jnp.inf)
+        if kept is None:
+            projection = self.projection(scene, path)
+            kept = self.finished(scene, projection, *visible_nodes(projection))
+        return occlusion_visibility(self, scene.volume, kept.darkness)
 
 
 class OcclusionVisibility(AbstractVisibility):
-    """What arrives of ambient light, `(bias + (1 - bias) I)^gamma`. `grid`: nodes that hold `1 - I`."""
+    """What arrives of ambient light, `(bias + (1 - bias) I)^gamma`. `grid`: nodes that hold `1 - sqrt(I)`."""
 
     grid: Grid
     bias: Scalar
@@ -155,7 +167,7 @@ class OcclusionVisibility(AbstractVisibility):
 
     def transmittances(self, points: Point, wanted: Any, *, reverse: bool) -> Transmittances:
         at = tuple(c * f for c, f in zip(points.p, self.scale, strict=True))
-        left = (1 - (1 - self.bias) * taken for taken in self.grid.interpolate(at, wanted))
+        left = (self.bias + (1 - self.bias) * jnp.square(1 - dark) for dark in self.grid.interpolate(at, wanted))
         return Transmittances(ambient=tuple(x if self.gamma is None else jnp.power(x, self.gamma) for x in left))
 
     @property
@@ -163,10 +175,34 @@ class OcclusionVisibility(AbstractVisibility):
         return None
 
 
-def occlusion_visibility(occlusion: Any, volume: Volume, taken: Float[Array, "x y z channels"]) -> OcclusionVisibility:
-    """Where nodes take so much of ambient light, what is left of it by the `bias` and `gamma` of an occlusion."""
-    x, y, z = taken.shape[:3]
-    return OcclusionVisibility(Grid.of(taken), occlusion.bias, occlusion.gamma, nodes_for_each_voxel(volume, (x, y, z)))
+def occlusion_visibility(occlusion: Any, volume: Volume, darkness: Float[Array, "x y z channels"]) -> OcclusionVisibility:
+    """What a grid of `1 - sqrt(I)` leaves of ambient light, by the `bias` and `gamma` of an occlusion."""
+    x, y, z = darkness.shape[:3]
+    return OcclusionVisibility(Grid.of(darkness), occlusion.bias, occlusion.gamma, nodes_for_each_voxel(volume, (x, y, z)))
+
+
+def darkness_at_voxels(
+    taken: Float[Array, "x y z channels"], volume: Volume, least: float = 0.0
+) -> Float[Array, "x2 y2 z2 channels"]:
+    """`1 - sqrt(I)` on the grid of the voxels, of nodes that hold `1 - I`, at `least` and at most 1."""
+    left = 1 - jnp.clip(resampled_cubic(taken, volume.shape), least, 1.0)
+    # The slope of a root at zero is infinite.
+    return 1 - jnp.sqrt(larger(left, DARKEST))
+
+
+def nodes_along(resolution: float | None, volume: Volume) -> Shape:
+    """Nodes along each axis, for a resolution or none."""
+    return node_shape(volume, _default_resolution(volume) if resolution is None else resolution)
+
+
+def _default_resolution(volume: Volume) -> float:
+    return 1.0 if math.prod(volume.shape) <= NODES else 0.5
+
+
+def resolutions(occlusion: Any, volume: Volume) -> Knob:
+    """The knob of a resolution, chosen or not."""
+    value = _default_resolution(volume) if occlusion.resolution is None else occlusion.resolution
+    return multiples("resolution", value, (1 / 2, 1), 2, most=1.0)
 
 
 class OcclusionProjection(AbstractProjection):
@@ -181,11 +217,11 @@ class OcclusionProjection(AbstractProjection):
     reach: Reach
     glow: Scalar | None
     rays: int = eqx.field(static=True)
-    resolution: float = eqx.field(static=True)
+    nodes_along: Shape = eqx.field(static=True)
 
     @property
     def shape(self) -> Shape:
-        return node_shape(self.volume, self.resolution)
+        return self.nodes_along
 
     def project(self, p: Float[Array, "nodes 3"]) -> tuple[Float[Array, "nodes channels"]]:
         """`1 - I` at grid positions."""

@@ -156,7 +156,7 @@ class RadianceTransfer(AbstractRadianceTransfer):
 
         return RadianceTransferProjection.of(scene, self._medium(scene, path))
 
-    def finished(self, scene: Any, *nodes: Any) -> ProjectedRadianceTransfer:
+    def finished(self, scene: Any, projection: Any, *nodes: Any) -> ProjectedRadianceTransfer:
         from jvr.effects.radiance_transfer_grid import finished
 
         return finished(scene, *nodes)

@@ -145,7 +145,8 @@ def _after_march(problem: Problem) -> frozenset[int]:
 def has_table_jacobian(scene: Scene) -> bool:
     """Whether entries of the transfer function act through what a sample is classified as, and nothing else."""
     by_gradient = scene.needs_gradient and scene.normals.follows_transfer(scene.volume)
-    shade = scene.shadows is not None or any(not getattr(scene, field).is_frozen for field in scene.precomputable)
+    precomputable = [getattr(scene, field) for field in scene.precomputable]
+    shade = scene.shadows is not None or any(not part.is_frozen or part.reads_transfer for part in precomputable)
     return isinstance(scene.transfer, AbstractTable) and not shade and not by_gradient
 
 

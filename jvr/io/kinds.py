@@ -86,7 +86,7 @@ KINDS: dict[type, dict[str, str]] = {
         "precomputed": "PrecomputedGradient",
     },
     AbstractRadianceTransfer: {"projected": "RadianceTransfer"},
-    AbstractOcclusion: {"local": "LocalOcclusion", "histogram": "HistogramOcclusion"},
+    AbstractOcclusion: {"local": "LocalOcclusion", "histogram": "HistogramOcclusion", "surface": "SurfaceOcclusion"},
     AbstractTransfer: {
         "linear": "LinearTransfer",
         "lut": "LutTransfer",

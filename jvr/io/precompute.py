@@ -24,7 +24,7 @@ from jvr.rendering.medium import absorbing, occupancy
 from jvr.rendering.settings import Settings
 
 # Changes whenever what is computed from the same inputs does: what was kept before is then of no use.
-VERSION = 4
+VERSION = 5
 # Order that materials are kept at under an environment of a lower one.
 LEAST_ORDER = 3
 # Nodes in a program of their own, between two reports of progress.
@@ -87,7 +87,7 @@ def precompute(
         if keep_unscattered and getattr(part, "scattering", None) is not None:
             bare = eqx.tree_at(lambda p: p.scattering, part, None)
         asked = dataclasses.replace(scene, **{field: bare})
-        whole = lambda _, asked=asked, field=field: _finished(asked, field, *_projection(asked, field).all_nodes())
+        whole = lambda _, asked=asked, field=field: _whole(asked, field)
         compute = lambda asked=asked, field=field: _project(asked, field, progress or (lambda share: None))
         projected = _kept(folder, whole, (bare, bare.sources(asked)), compute, field.replace("_", " "), report)
         scene = dataclasses.replace(scene, **{field: part.with_projected(projected)})
@@ -105,7 +105,7 @@ def as_precomputed(scene: Scene) -> Scene:
             assert scene.material is not None
             scene = dataclasses.replace(scene, material=scene.material.projected(_material_order(scene)))
         fields = [field for field in scene.precomputable if not getattr(scene, field).is_frozen]
-        return scene.material, {field: _finished(scene, field, *_projection(scene, field).all_nodes()) for field in fields}
+        return scene.material, {field: _whole(scene, field) for field in fields}
 
     material, parts = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(shaped, scene))
     made = {field: getattr(scene, field).with_projected(projected) for field, projected in parts.items()}
@@ -123,8 +123,13 @@ def _projection(scene: Scene, field: str) -> Any:
     return getattr(scene, field).projection(scene, lambda graded: absorbing(scene, where, graded))
 
 
-def _finished(scene: Scene, field: str, *nodes: Array) -> Any:
-    return getattr(scene, field).finished(scene, *nodes)
+def _finished(scene: Scene, field: str, projection: Any, *nodes: Array) -> Any:
+    return getattr(scene, field).finished(scene, projection, *nodes)
+
+
+def _whole(scene: Scene, field: str) -> Any:
+    projection = _projection(scene, field)
+    return _finished(scene, field, projection, *projection.all_nodes())
 
 
 def _project(scene: Scene, field: str, progress: Progress) -> Any:
@@ -141,7 +146,7 @@ def _project(scene: Scene, field: str, progress: Progress) -> Any:
         for array, found in zip(held, _some(projection, jnp.asarray(index, jnp.int32)), strict=True):
             array[index] = np.asarray(found)
         progress((begin + len(piece)) / len(active))
-    return jax.jit(_finished, static_argnums=1)(scene, field, *map(jnp.asarray, held))
+    return jax.jit(_finished, static_argnums=1)(scene, field, projection, *map(jnp.asarray, held))
 
 
 @jax.jit

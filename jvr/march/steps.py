@@ -47,14 +47,22 @@ class Rays(NamedTuple):
         return self._replace(end=None)
 
 
+class OnSurface(NamedTuple):
+    """Where a point lies on an isosurface: its isovalue, and the gradient of the scalar in the world."""
+
+    value: Float[Array, ""]
+    gradient: Triple
+
+
 class Point(NamedTuple):
     """One sample on one ray: its grid position, the ray's direction (grid coordinates per world length), the ray's index in the batch
-    and `k`, the index of its segment."""
+    and `k`, the index of its segment; `surface`: where it is one of an isosurface."""
 
     p: Triple
     direction: Triple
     ray: Int[Array, ""]
     k: Int[Array, ""]
+    surface: OnSurface | None = None
 
 
 class Transmittances(NamedTuple):

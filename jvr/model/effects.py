@@ -220,7 +220,12 @@ class AbstractPrecomputable(AbstractPart):
     @property
     def is_final(self) -> bool:
         """Whether a picture has nothing left to do but to read it."""
-        return self.is_frozen
+        return self.is_frozen and not self.reads_transfer
+
+    @property
+    def reads_transfer(self) -> bool:
+        """Whether each picture sees what was computed beforehand by the transfer function of its scene."""
+        return False
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         made = "computed beforehand" if self.is_frozen else "computed in each picture: jvr.precompute"
@@ -244,7 +249,7 @@ class AbstractPrecomputable(AbstractPart):
         `all_nodes()`, what all are. `path`: as of `visibility`."""
 
     @abc.abstractmethod
-    def finished(self, scene: Any, *nodes: Any) -> Any:
+    def finished(self, scene: Any, projection: Any, *nodes: Any) -> Any:
         """What `with_projected` takes, from what all nodes of the scene's projection are."""
 
     @abc.abstractmethod
@@ -337,10 +342,13 @@ class AbstractRadianceTransfer(AbstractPrecomputable):
         """How far above a surface, in the world, it is known what arrives."""
 
 
-class AbstractOcclusion(AbstractPrecomputable):
-    """Occlusion: how much of the ambient light the medium near a point takes away."""
+class AbstractOcclusion(AbstractPart):
+    """Occlusion: how much of the ambient light what is near a point takes away."""
 
-    needs: ClassVar[tuple[str, ...]] = ("ambient light", "short rays")
+    @property
+    @abc.abstractmethod
+    def of_surfaces(self) -> bool:
+        """Whether it is that of isosurfaces, and not of the medium."""
 
     def without(self, scene: Any) -> Any:
         return scene.replaced(occlusion=None)
@@ -348,3 +356,13 @@ class AbstractOcclusion(AbstractPrecomputable):
     @abc.abstractmethod
     def visibility(self, scene: Any, path: Any) -> Any:
         """That of the scene's ambient light, as `AbstractPart.visibility`."""
+
+
+class AbstractNodeOcclusion(AbstractOcclusion, AbstractPrecomputable):
+    """Occlusion by the medium, computed at the nodes of a grid."""
+
+    needs: ClassVar[tuple[str, ...]] = ("ambient light", "short rays")
+
+    @property
+    def of_surfaces(self) -> bool:
+        return False

@@ -38,7 +38,9 @@ class Knob(NamedTuple):
     bounds_error: bool = False
 
     def coarser(self, value: Any) -> Any:
-        """The next coarser value, or `None` where there is none; of a number that is none of them, too."""
+        """The next coarser value, or `None` where there is none; of a number that is none of them, too. Of `None`, by which a part chooses
+        for itself, that of the finest."""
+        value = self.values[-1] if value is None else value
         if value in self.values:
             before = self.values[: self.values.index(value)]
         else:

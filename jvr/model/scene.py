@@ -57,7 +57,7 @@ class Scene(AbstractPart):
       `jvr.MaterialByValue`, or `None`.
     - `radiance_transfer`: how much of the environment reaches a point: `jvr.RadianceTransfer(...)`, or `None`: all of it.
     - `occlusion`: how much of the ambient light the medium near a point takes away: `jvr.LocalOcclusion(...)`,
-      `jvr.HistogramOcclusion(...)`, or `None`: nothing.
+      `jvr.HistogramOcclusion(...)`, or, of isosurfaces, `jvr.SurfaceOcclusion(...)`, or `None`: nothing.
     - `geometry`: opaque geometry that rays end at, `jvr.DepthImage`, `jvr.Mesh`, or `None`.
     - `normals`: how gradients are estimated, where something asks for them: `jvr.AnalyticGradient()` (default),
       `jvr.ForwardDifferences()`, `jvr.CentralDifferences()`, `jvr.SobelDifferences()`, `jvr.PrecomputedGradient()`.
@@ -65,8 +65,9 @@ class Scene(AbstractPart):
     - `specular`: how surfaces mirror and bend rays, `jvr.Specular(...)`, or `None`: not at all.
 
     **Raises** `ValueError` for shadows without a light, or with nothing that shows light; for occlusion without ambient light, or with
-    nothing that shows it; for one of environment and material without the other, and for radiance transfer without both; for surfaces
-    between nearest voxels, or whose normals are those of the opacity; for a specular part without surfaces, or with a depth image.
+    nothing that shows it, and that of surfaces without these; for one of environment and material without the other, and for radiance
+    transfer without both; for surfaces between nearest voxels, or whose normals are those of the opacity; for a specular part without
+    surfaces, or with a depth image.
     """
 
     volume: Volume = parameter(doc="a jvr.Volume, as jvr.read_volume gives it")
@@ -193,12 +194,15 @@ class Scene(AbstractPart):
 
     def replaced(self, **parts: Any) -> "Scene":
         """The scene with other parts, and without what these cannot carry: shadows go with the last light that casts them and the last part
-        that shows them, occlusion with the last ambient light or that part, material and radiance transfer with the environment, what is
-        specular with the surfaces."""
+        that shows them, occlusion with the last ambient light, that part or its surfaces, material and radiance transfer with the
+        environment, what is specular with the surfaces."""
         light, shading, scattering = (parts.get(name, getattr(self, name)) for name in ("lights", "shading", "scattering"))
         if not any(_casters(light)) or (shading is None and scattering is None):
             parts["shadows"] = None
         if not any(isinstance(one, AmbientLight) for one in light) or (shading is None and scattering is None):
+            parts["occlusion"] = None
+        held = parts.get("occlusion", self.occlusion)
+        if held is not None and held.of_surfaces and (shading is None or parts.get("surfaces", self.surfaces) is None):
             parts["occlusion"] = None
         if not _environments(light, parts.get("environment", self.environment)):
             parts |= {"material": None, "radiance_transfer": None}
@@ -249,6 +253,12 @@ def _check_light(scene: Scene) -> None:
         raise ValueError("occlusion is that of ambient light: add a jvr.AmbientLight to lights=, or leave occlusion out")
     if scene.occlusion is not None and scene.shading is None and scene.scattering is None:
         raise ValueError("nothing shows this occlusion: set shading=jvr.Lambert() or scattering=jvr.SingleScattering()")
+    if scene.occlusion is not None and scene.occlusion.of_surfaces and scene.surfaces is None:
+        raise ValueError(
+            "jvr.SurfaceOcclusion is that of isosurfaces: set surfaces=jvr.Isosurfaces(...), or occlusion=jvr.LocalOcclusion()"
+        )
+    if scene.occlusion is not None and scene.occlusion.of_surfaces and scene.shading is None:
+        raise ValueError("surfaces show no ambient light without a shading: set shading=jvr.Lambert()")
 
 
 def _check_environment(scene: Scene) -> None:

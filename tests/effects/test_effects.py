@@ -26,6 +26,7 @@ MODULES += (
     "diffusion",
     "occlusion",
     "histogram_occlusion",
+    "surface_occlusion",
 )
 MODELS = ("material", "brdf", "microfacet", "merl", "dipole")
 LIGHT = {"lights": (jvr.DirectionalLight((0.3, -0.5, -1.0)), jvr.AmbientLight(0.2))}

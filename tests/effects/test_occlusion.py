@@ -12,8 +12,9 @@ from scenes import OBLIQUE, affine, linear_transfer, perspective, render, voxels
 from scipy.ndimage import map_coordinates
 
 import jvr
-from jvr.effects.histogram_occlusion import LocalHistograms
+from jvr.effects.local_histograms import LocalHistograms
 from jvr.effects.occlusion import ProjectedOcclusion
+from jvr.fitting.kinds import has_table_jacobian
 from jvr.io.config import build_cameras, build_scene, read_config
 from jvr.io.precompute import as_precomputed
 from jvr.march.steps import Point
@@ -59,7 +60,7 @@ def visibility(one: jvr.Scene):
 def factors(one: jvr.Scene) -> np.ndarray:
     """What every node leaves of ambient light, visible or not."""
     grid = visibility(one).grid
-    return 1 - np.asarray(grid.rows, np.float64).reshape(*[n + 1 for n in grid.cells], -1)
+    return (1 - np.asarray(grid.rows, np.float64).reshape(*[n + 1 for n in grid.cells], -1)) ** 2
 
 
 def picture(one: jvr.Scene) -> np.ndarray:
@@ -101,10 +102,11 @@ def brute_force(one: jvr.Scene, p: np.ndarray, radius: float, offset: float) -> 
 
 @pytest.mark.parametrize("sigma", [0.0, 1e-3, 0.5, 20.0])
 def test_a_homogeneous_ball_has_the_closed_form(sigma):
-    """`phi1(sigma (R - a))` at a node whose ball lies in the volume; of grains of which each takes as much as it is opaque."""
-    grains = jvr.HistogramOcclusion(4, 64, radius=3.0, offset=0.5, samples=8, resolution=1.0, grain=0.7)
-    for occlusion, opaque in ((local(3.0, 0.5), sigma), (grains, -np.expm1(-0.7 * sigma) / 0.7)):
-        assert factors(homogeneous(sigma, occlusion))[3, 3, 3, 0] == pytest.approx(phi1(2.5 * opaque), abs=2e-6)
+    """`phi1(sigma (R - a))` at a node whose ball lies in the volume, whatever scalars are in it."""
+    histograms = jvr.HistogramOcclusion(4, 8, shells=3, radius=3.0, offset=0.5, samples=8, resolution=1.0)
+    assert factors(homogeneous(sigma, local(3.0, 0.5)))[3, 3, 3, 0] == pytest.approx(phi1(2.5 * sigma), abs=3e-6)
+    # Rays that leave the volume just before they end may be in one cluster with those that do not.
+    assert factors(homogeneous(sigma, histograms))[3, 3, 3, 0] == pytest.approx(phi1(2.5 * sigma), abs=5e-4)
 
 
 def test_what_glows_lights_what_is_near():
@@ -115,10 +117,10 @@ def test_what_glows_lights_what_is_near():
 
     def lit(emission):
         glowing = dataclasses.replace(one, transfer=dataclasses.replace(one.transfer, emission=emission))
-        return jnp.sum(visibility(glowing).grid.rows.reshape(*SHAPE, 3)[3, 3, 3])
+        return jnp.sum((1 - visibility(glowing).grid.rows.reshape(*SHAPE, 3)[3, 3, 3]) ** 2)
 
     slope = jax.grad(lit)(one.transfer.emission)
-    np.testing.assert_allclose(np.sum(slope, axis=0), -2 * phi1(1.25), rtol=1e-5)
+    np.testing.assert_allclose(np.sum(slope, axis=0), 2 * phi1(1.25), rtol=1e-5)
     with pytest.raises(ValueError, match=r"nothing glows: give the transfer function emission="):
         visibility(homogeneous(0.5, local(3.0, glow=1.0)))
 
@@ -146,7 +148,7 @@ def test_ambient_light_alone_is_multiplied():
     """With `(bias + (1 - bias) I)^gamma`."""
 
     def drawn(taken, radiance=1.0, **numbers):
-        kept = ProjectedOcclusion(jnp.full((2, 2, 2, 1), taken), jnp.zeros((0, 2), jnp.uint32), pinned=True)
+        kept = ProjectedOcclusion(jnp.full((2, 2, 2, 1), 1 - np.sqrt(1 - taken)), jnp.zeros((0, 2), jnp.uint32), pinned=True)
         lights = (jvr.AmbientLight(radiance * ambient()[0].radiance), and_sun()[1])
         return picture(scene(jvr.LocalOcclusion(**numbers).with_projected(kept), lights=lights))
 
@@ -200,29 +202,89 @@ def test_extinction_is_gone_beyond_a_clipping_box():
 
 # --- Histograms ------------------------------------------------------------------------------------------------------
 
+# Of three rays, as many clusters as rays.
+FEW = {"shells": 3, "clusters": 65536, "radius": 0.9, "offset": 0.3, "samples": 6, "resolution": 1.0}
+
+
+def along_rays(one: jvr.Scene, occlusion, node) -> tuple[np.ndarray, np.ndarray]:
+    """Scalars along the rays of a node, each in the middle of a segment, in shells, and which of them are inside."""
+    index = np.arange(occlusion.rays)
+    cosine = 1 - (2 * index + 1) / occlusion.rays
+    turn = np.pi * (3 - np.sqrt(5)) * index
+    sine = np.sqrt(1 - cosine**2)
+    directions = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=1)
+    matrix, values = np.asarray(one.volume.world_from_grid, np.float64), np.asarray(one.volume.values, np.float64)
+    length = (float(occlusion.radius) - float(occlusion.offset)) / occlusion.samples
+    distance = float(occlusion.offset) + length * (np.arange(occlusion.samples) + 0.5)
+    at = np.array(node) + (directions @ np.linalg.inv(matrix[:3, :3]).T)[:, None] * distance[:, None]
+    inside = np.all((at >= 0) & (at <= np.array(values.shape) - 1), axis=-1)
+    scalars = map_coordinates(values, at.reshape(-1, 3).T, order=1, mode="nearest")
+    shape = (occlusion.rays, occlusion.shells, -1)
+    return scalars.reshape(shape), inside.reshape(shape)
+
 
 def test_histograms_are_those_of_brute_force():
-    """Hats around the scalars of each bin, averaged over the ball with weight `1 / d^2`; what a transfer function makes of them is what
-    their bins take away."""
-    one = scene(jvr.HistogramOcclusion(4, 64, radius=4.0, offset=0.5, samples=8, resolution=1.0, bleeding=0.5))
+    """With as many clusters as rays nothing is lost: hats around the scalars of each bin, in each shell of each ray. What a transfer
+    function makes of them is marched through the shells."""
+    occlusion = jvr.HistogramOcclusion(9, 3, **FEW)
+    values = voxels((3, 3, 3))
+    one = scene(occlusion, volume=jvr.Volume(values))
     kept = jvr.precompute(one)
     held: LocalHistograms = kept.occlusion.projected
-    positions = np.linspace(np.min(voxels(SHAPE)), np.max(voxels(SHAPE)), 4)
-    np.testing.assert_allclose(held.positions, positions, rtol=1e-5)
-    assert held.length == pytest.approx(3.5)
-    for node in ((2, 3, 3), (0, 5, 2)):
-        s, inside = around(one, np.array(node), 4.0, 0.5)
-        hats = np.maximum(0, 1 - np.abs(s[..., None] - positions) / (positions[1] - positions[0]))
-        np.testing.assert_allclose(held.weights[node], np.mean(hats * inside[..., None], axis=(0, 1)), atol=0.02)
-    # A new transfer function leaves them as they are.
+    np.testing.assert_allclose(held.extents, [0.2] * 3, rtol=1e-5)
+    positions = np.asarray(held.positions, np.float64)
+    np.testing.assert_allclose(positions, np.linspace(np.min(values), np.max(values), 9), rtol=1e-5)
+    node = (1, 1, 1)
+    s, inside = along_rays(one, occlusion, node)
+    assert np.all(inside)
+    expected = np.mean(np.maximum(0, 1 - np.abs(s[..., None] - positions) / (positions[1] - positions[0])), axis=2)
+    np.testing.assert_allclose(np.asarray(held.weights)[np.asarray(held.codes)[node]], expected, atol=2e-5)
+    # The extinction of each bin, as its hat sees it.
+    table, looks = linear_transfer(), positions[:, None] + np.arange(-8, 9) / 9 * (positions[1] - positions[0])
+    hat = 1 - np.abs(np.arange(-8, 9)) / 9
+    extinction = np.interp(np.clip(looks, positions[0], positions[-1]), table.positions, table.sigma_t) @ (hat / hat.sum())
+    tau = expected @ extinction * 0.2
+    left = np.mean(np.exp(-(np.cumsum(tau, axis=1) - tau)) * phi1(tau))
+    assert factors(kept)[node][0] == pytest.approx(left, abs=2e-5)
+
+
+def test_a_new_transfer_function_changes_no_histogram():
+    """What is invisible takes nothing; what is homogeneous sends on its own colour."""
+    one = scene(jvr.HistogramOcclusion(4, 8, bleeding=0.5, **FEW | {"radius": 4.0}))
+    kept = jvr.precompute(one)
     rgb, sigma = np.array([0.2, 0.5, 1.0]), 0.7
-    other = dataclasses.replace(kept, transfer=jvr.LinearTransfer([0.0, 0.3, 0.6, 1.0], [rgb] * 4, [sigma] * 4))
-    assert other.occlusion.stale(other) == ()
-    left = phi1(3.5 * np.asarray(held.weights).sum(axis=-1) * -np.expm1(-2 * sigma) / 2)[..., None]
-    np.testing.assert_allclose(factors(other), left + 0.5 * (1 - left) * rgb, atol=1e-6)
-    # What is invisible takes nothing.
-    clear = dataclasses.replace(kept, transfer=jvr.LinearTransfer([0.0, 0.3, 0.6, 1.0], [rgb] * 4, [0.0] * 4))
-    np.testing.assert_array_equal(factors(clear), 1.0)
+    like = lambda sigma: dataclasses.replace(kept, transfer=jvr.LinearTransfer([0.0, 0.3, 0.6, 1.0], [rgb] * 4, [sigma] * 4))
+    assert like(sigma).occlusion.stale(like(sigma)) == ()
+    plain = factors(dataclasses.replace(like(sigma), occlusion=kept.occlusion.rebuilt(bleeding=0.0)))
+    assert np.ptp(plain) > 0.1
+    np.testing.assert_allclose(factors(like(sigma)), plain + 0.5 * (1 - plain) * rgb, atol=2e-6)
+    np.testing.assert_array_equal(factors(like(0.0)), 1.0)
+
+
+def test_histograms_know_what_stands_in_front_of_what():
+    """A wall and, far behind it, another: the second takes next to nothing of what the first has left."""
+    values = np.zeros((13, 13, 13), np.float32)
+    values[8] = 1.0
+    far = values.copy()
+    far[10:12] = 1.0
+    opaque = jvr.LinearTransfer([0.0, 0.4, 0.6, 1.0], [[1.0, 1.0, 1.0]] * 4, [0.0, 0.0, 9.0, 9.0])
+    occlusion = jvr.HistogramOcclusion(16, radius=6.0, offset=0.5, resolution=0.5)
+    walls = lambda v: scene(occlusion, volume=jvr.Volume(v), transfer=opaque)
+    one, two = (factors(walls(v))[6, 6, 6, 0] for v in (values, far))
+    (truth,) = brute_force(walls(values), np.array([[6, 6, 6]]), 6.0, 0.5)
+    assert one == pytest.approx(truth, abs=0.03)
+    assert two == pytest.approx(one, abs=0.02)
+
+
+@pytest.mark.slow
+def test_clusters_come_nearer_as_there_are_more():
+    one = scene(jvr.HistogramOcclusion(32, 16, **FEW | {"radius": 4.0}))
+    errors, truth = [], factors(one)
+    for clusters in (1, 16, 256, 4096):
+        occlusion = jvr.HistogramOcclusion(32, 16, **FEW | {"radius": 4.0, "clusters": clusters})
+        errors.append(np.sqrt(np.mean(np.square(factors(dataclasses.replace(one, occlusion=occlusion)) - truth))))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[3] < 0.003 < 0.1 * errors[0]
 
 
 def test_histograms_know_no_gradients():
@@ -239,7 +301,6 @@ ARRAYS = {
     "voxels": lambda s: s.volume.values,
     "radius": lambda s: s.occlusion.radius,
     "offset": lambda s: s.occlusion.offset,
-    "grain": lambda s: getattr(s.occlusion, "grain", None),
     "bias": lambda s: s.occlusion.bias,
     "gamma": lambda s: s.occlusion.gamma,
 }
@@ -251,16 +312,20 @@ def differentiable(method: str) -> jvr.Scene:
     values[5:] *= 0.2
     transfer = jvr.LinearTransfer([0.1, 0.3, 0.6, 0.9], voxels((4, 3)), [0.0, 0.0, 0.4, 0.7])
     numbers = {"radius": 2.7, "offset": 0.4, "samples": 3, "resolution": 0.6, "bias": 0.1, "gamma": 0.8}
-    numbers |= {"grain": 0.9} if method == "histogram" else {}
     return scene(METHODS[method](rays=6, **numbers), volume=jvr.Volume(values), transfer=transfer, lights=and_sun())
+
+
+# What histograms have no derivative in.
+DETACHED = {"voxels", "radius", "offset"}
 
 
 def compare_with_differences(loss, one: jvr.Scene) -> None:
     """Reverse mode against central differences; of voxels and entries some."""
+    without = DETACHED if isinstance(one.occlusion, jvr.HistogramOcclusion) else set()
     gradient = eqx.filter_jit(eqx.filter_grad(loss))(one)
     rng, loss = np.random.default_rng(3), jax.jit(loss)
     for name, of in ARRAYS.items():
-        if of(one) is None:
+        if of(one) is None or name in without:
             continue
         array, found = np.asarray(of(one)), np.asarray(of(gradient))
         assert np.any(found != 0), name
@@ -389,6 +454,12 @@ def test_plans_and_advice_say_what_it_is():
     assert one.replaced(lights=()).occlusion is None
     assert one.replaced(shading=None).occlusion is None
     assert one.replaced(lights=and_sun()).occlusion is not None
+
+
+def test_a_fit_knows_what_follows_the_transfer_function():
+    """Kept histograms do, of which the table's own Jacobian knows nothing; what rays have found does not."""
+    assert has_table_jacobian(as_precomputed(scene(jvr.LocalOcclusion(4, samples=2))))
+    assert not has_table_jacobian(as_precomputed(scene(jvr.HistogramOcclusion(4, 2, samples=2))))
 
 
 # --- Hard cases ------------------------------------------------------------------------------------------------------

@@ -119,6 +119,11 @@ TABLE = "{positions=[0.1,0.9],values=[0.2,0.4]}"
         ("shadows", "{kind='opacity-map',texels=64,layers=8}", jvr.OpacityShadowMap(64, 8)),
         ("shadows", "{kind='deep-map',texels=64,layers=8,error=0.02}", jvr.DeepShadowMap(64, 8, error=0.02)),
         ("occlusion", "{rays=8,radius=3,gamma=2}", jvr.LocalOcclusion(8, radius=3, gamma=2)),
+        (
+            "occlusion",
+            "{kind='surface',rays=8,softness=0.1}",
+            jvr.SurfaceOcclusion(8, softness=0.1),
+        ),
         ("occlusion", "{kind='histogram',bins=8,bleeding=0.5}", jvr.HistogramOcclusion(8, bleeding=0.5)),
     ],
 )

@@ -110,8 +110,9 @@ def frozen() -> jvr.Scene:
 
 def histograms() -> jvr.Scene:
     """With numbers in place of what `jvr.precompute` takes seconds for."""
-    weights = np.random.default_rng(8).random((3, 3, 4, 5)).astype(np.float32)
-    arrays = map(jnp.asarray, (weights, np.arange(5.0), 3.0, np.arange(12, dtype=np.uint32).reshape(6, 2)))
+    rng, made_for = np.random.default_rng(8), np.arange(12, dtype=np.uint32).reshape(6, 2)
+    weights, codes = rng.random((7, 2, 5)).astype(np.float32), rng.integers(0, 7, (3, 3, 4, 6)).astype(np.uint16)
+    arrays = map(jnp.asarray, (weights, codes, np.arange(5.0), np.array([1.0, 2.0]), 0.0, made_for))
     occlusion = jvr.HistogramOcclusion(5, resolution=0.4, bleeding=0.5).with_projected(jvr.LocalHistograms(*arrays, pinned=True))
     return lit(lights=[jvr.AmbientLight()], occlusion=occlusion)
 
