@@ -10,6 +10,7 @@ from scenes import linear_transfer, render
 
 import jvr
 from jvr.march.steps import OnSurface, Point
+from jvr.rendering.medium import absorbing
 
 SHAPE = (25, 25, 25)
 X, Y, Z = np.meshgrid(*[np.arange(n, dtype=np.float32) - 12 for n in SHAPE], indexing="ij")
@@ -28,7 +29,8 @@ def found(one: jvr.Scene, x, gradient, value=0.0):
     column = lambda v: tuple(jnp.asarray(v).T)
     surface = OnSurface(jnp.full(n, value), column(gradient))
     points = Point(column(x), column(gradient), *(jnp.zeros(n, jnp.int32),) * 2, surface)
-    return one.occlusion.visibility(one, None).transmittances(points, jnp.ones(n, bool), reverse=True).ambient[0]
+    visibility = one.occlusion.visibility(one, lambda graded: absorbing(one, None, graded))
+    return visibility.transmittances(points, jnp.ones(n, bool), reverse=True).ambient[0]
 
 
 def at(values, occlusion, x, gradient) -> np.ndarray:
