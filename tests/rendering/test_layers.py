@@ -37,7 +37,7 @@ def test_layers_sum_up_to_the_picture(occluded):
     """Diffuse and specular where a surface is hit, the background elsewhere."""
     _, _, found = occluded
     hit = np.any(np.asarray(found.layers.normal) != 0, axis=-1)
-    assert 0.2 < hit.mean() < 0.9
+    assert 0.1 < hit.mean() < 0.9
     total = np.asarray(found.layers.diffuse + found.layers.specular)
     np.testing.assert_allclose(np.asarray(found.rgb)[hit], total[hit], **EXACT)
     np.testing.assert_allclose(np.asarray(found.rgb)[~hit], np.broadcast_to([0.1, 0.2, 0.3], total[~hit].shape), **EXACT)
@@ -112,7 +112,7 @@ def test_what_has_no_layers_says_so():
         jvr.render_layers(made, camera, jvr.Settings(pixel_samples=2))
     done = CliRunner().invoke(app, ["render", "configs/isosurface.toml", "-o", "a.png", "--layers"])
     assert done.exit_code != 0
-    assert "--layers: a PNG has no room for them; name an .exr with -o" in done.output + str(done.stderr)
+    assert str(done.exception) == "--layers: a PNG has no room for them; name an .exr with -o"
 
 
 @pytest.mark.slow
