@@ -139,6 +139,7 @@ if TYPE_CHECKING:
     from jvr.rendering.advise import advise as advise
     from jvr.rendering.image import Rendering as Rendering
     from jvr.rendering.image import RenderStats as RenderStats
+    from jvr.rendering.layers import render_layers as render_layers
     from jvr.rendering.marching import Uniform as Uniform
     from jvr.rendering.measure import Measurement as Measurement
     from jvr.rendering.measure import measure as measure

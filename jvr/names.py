@@ -105,6 +105,7 @@ NAMES = {
     "jvr.pictures": ("linear_from_srgb", "srgb_from_linear", "write_image"),
     "jvr.rendering.advise": ("Advice", "advise"),
     "jvr.rendering.image": ("RenderStats", "Rendering"),
+    "jvr.rendering.layers": ("render_layers",),
     "jvr.rendering.marching": ("Uniform",),
     "jvr.rendering.measure": ("Measurement", "measure"),
     "jvr.rendering.plan": ("plan",),

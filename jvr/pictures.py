@@ -9,8 +9,9 @@ import contextlib
 import io
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,10 @@ from jvr.types import ArrayLike
 
 Pixels = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
+
+
+# Layers whose numbers are coordinates and no colours.
+VECTORS = ("position", "normal")
 
 
 class ImageError(ValueError):
@@ -69,16 +74,22 @@ def linear_from_srgb(code: ArrayLike) -> Float[np.ndarray, "..."]:
 
 
 def write_image(
-    path: str | bytes | os.PathLike, image: ArrayLike, alpha: ArrayLike | None = None, *, depth: ArrayLike | None = None
+    path: str | bytes | os.PathLike,
+    image: ArrayLike,
+    alpha: ArrayLike | None = None,
+    *,
+    depth: ArrayLike | None = None,
+    layers: Mapping[str, ArrayLike] = MappingProxyType({}),
 ) -> None:
     """Writes linear radiance to `.exr` (float32, unchanged; channels A and Z for `alpha` and `depth`) or `.png` (8-bit sRGB).
 
-    **Arguments:** `image`: `(height, width, 3)`; `alpha`, `depth`: `(height, width)`. With an `alpha`, `image` is the medium's
-    light over black. A PNG then holds it divided by alpha: light beyond alpha (emission without extinction) does not fit and is
-    clipped.
+    **Arguments:** `image`: `(height, width, 3)`; `alpha`, `depth`: `(height, width)`; `layers`: `(height, width, 1 or 3)` by name, whose
+    channels in the file are called `NAME.Y`, or `NAME.R`, `NAME.G` and `NAME.B`, of `position` and `normal` `NAME.X`, `NAME.Y` and
+    `NAME.Z`. With an `alpha`, `image` is the medium's light over black. A PNG then holds it divided by alpha: light beyond alpha (emission
+    without extinction) does not fit and is clipped.
 
     The file appears under its name once it is whole; where writing fails, a file that was there before stays.
-    **Raises** `ValueError` for shapes that do not fit, integers in place of radiance, another extension, and, in a PNG, a depth or
+    **Raises** `ValueError` for shapes that do not fit, integers in place of radiance, another extension, and, in a PNG, a depth, layers or
     pixels that are not finite;
     `OSError` where the file cannot be written.
     """
@@ -99,14 +110,27 @@ def write_image(
             raise ImageError(
                 path, f"{name} has shape {plane.shape}, the image {pixels.shape[:2]}: give one {name} for each pixel"
             )
+    named = {name: plane for layer, values in layers.items() for name, plane in _channels(path, layer, values, pixels)}
     if path.suffix.lower() == ".exr":
-        _write_exr(path, pixels, planes.get("alpha"), planes.get("depth"))
+        _write_exr(path, pixels, planes.get("alpha"), planes.get("depth"), named)
+    elif named:
+        raise ImageError(path, "a PNG has no room for layers; write .exr, or leave layers out")
     elif "depth" in planes:
         raise ImageError(path, "a PNG has no room for depth; write .exr, or leave depth out")
     else:
         content = _png(path, pixels, planes.get("alpha"))
         with replacing(path) as temporary:
             temporary.write_bytes(content)
+
+
+def _channels(path: Path, layer: str, values: ArrayLike, pixels: Pixels) -> Iterator[tuple[str, Plane]]:
+    """The channels of a layer, by their names in a file."""
+    array = np.asarray(values, np.float32)
+    names = {1: "Y", 3: "XYZ" if layer in VECTORS else "RGB"}
+    if array.ndim != 3 or array.shape[:2] != pixels.shape[:2] or array.shape[2] not in names:
+        wanted = f"({pixels.shape[0]}, {pixels.shape[1]}, 1 or 3)"
+        raise ImageError(path, f"the layer {layer} has shape {array.shape}: give numbers of each pixel, {wanted}")
+    yield from ((f"{layer}.{name}", array[..., c]) for c, name in enumerate(names[array.shape[2]]))
 
 
 def shown(image: ArrayLike) -> bytes:
@@ -145,9 +169,10 @@ def png_bytes(codes: UInt8[np.ndarray, "height width channels"]) -> bytes:
     return buffer.getvalue()
 
 
-def _write_exr(path: Path, pixels: Pixels, alpha: Plane | None, depth: Plane | None) -> None:
+def _write_exr(path: Path, pixels: Pixels, alpha: Plane | None, depth: Plane | None, named: Mapping[str, Plane]) -> None:
     planes = {name: np.ascontiguousarray(pixels[..., c]) for c, name in enumerate("RGB")}
     planes |= {name: np.ascontiguousarray(plane) for name, plane in (("A", alpha), ("Z", depth)) if plane is not None}
+    planes |= {name: np.ascontiguousarray(plane) for name, plane in named.items()}
     with replacing(path) as temporary, quiet():
         import OpenEXR
 

@@ -31,8 +31,10 @@ from jvr.cli.options import (
     Input,
     Intercept,
     Json,
+    Layers,
     Missing,
     NanValue,
+    Orbit,
     Origin,
     Series,
     Set,
@@ -97,11 +99,9 @@ def render(
         bool | None,
         typer.Option("--lit/--unlit", help="Surfaces under a light at the eye, or colours as they are.", show_default="lit"),
     ] = None,
-    orbit: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="So many pictures from all around, and an animation (.gif).", show_default=False),
-    ] = None,
+    orbit: Orbit = None,
     size: Annotated[int | None, typer.Option(min=1, help="Width and height in pixels, for every camera.")] = None,
+    layers: Layers = False,
     sets: Set = None,
     shape: Shape = None,
     dtype: Dtype = None,
@@ -134,7 +134,7 @@ def render(
         config = _sized(config, size)
     for note in notes:
         explain(f"note: {note}", 0)
-    report = render_pictures(config, output, volume, animated=orbit is not None)
+    report = render_pictures(config, output, volume, animated=orbit is not None, layers=layers)
     report["notes"] = notes
     lines = [*report["outputs"], *lines_of(report["precomputed"])]
     _print(

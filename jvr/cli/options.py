@@ -33,3 +33,8 @@ Missing = Annotated[
 ]
 Input = Annotated[Path, typer.Argument(metavar="CONFIG|VOLUME", help="A configuration (.toml) or a volume file.")]
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="A configuration (.toml).")]
+Layers = Annotated[bool, typer.Option("--layers", help="Layers of its surfaces as channels of the .exr.", show_default=False)]
+Orbit = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="So many pictures from all around, and an animation (.gif).", show_default=False),
+]

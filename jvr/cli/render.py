@@ -24,9 +24,13 @@ BYTES = 48
 TURN = 6.0
 
 
-def render_pictures(config: Config, output: Path, volume: Volume | None = None, *, animated: bool = False) -> dict[str, Any]:
+def render_pictures(
+    config: Config, output: Path, volume: Volume | None = None, *, animated: bool = False, layers: bool = False
+) -> dict[str, Any]:
     """Renders every camera of a configuration: to `output`, or with several cameras to numbered files beside it, and where these are to be
     `animated`, to a moving picture beside them. `volume`: that of the configuration, where it is read already."""
+    if layers and output.suffix.lower() != ".exr":
+        raise BadInput("--layers: a PNG has no room for them; name an .exr with -o")
     start_jax()
     began = time.perf_counter()
     beforehand = Beforehand()
@@ -46,6 +50,7 @@ def render_pictures(config: Config, output: Path, volume: Volume | None = None, 
 
     from jvr.cli.runtime import compiling
     from jvr.pictures import write_image
+    from jvr.rendering.layers import render_layers
     from jvr.rendering.render import render
 
     pictures, frames, compile_seconds = [], [], 0.0
@@ -55,14 +60,15 @@ def render_pictures(config: Config, output: Path, volume: Volume | None = None, 
         for i, camera in enumerate(cameras):
             with compiling() as compiled:
                 start = time.perf_counter()
-                picture = jax.block_until_ready(_rendered(render, scene, camera, settings))
+                picture = jax.block_until_ready(_rendered(render_layers if layers else render, scene, camera, settings))
                 seconds = time.perf_counter() - start
             compile_seconds += compiled[0]
             pictures.append(_numbers(picture, camera, outputs[i], seconds - compiled[0]))
             # With a background the colours are no longer those of the medium alone, which is what alpha belongs to.
             alpha = np.asarray(picture.alpha) if scene.background is None else None
             depth = {"depth": np.asarray(picture.depth)} if outputs[i].suffix.lower() == ".exr" else {}
-            write_image(outputs[i], np.asarray(picture.rgb), alpha, **depth)
+            named = {} if picture.layers is None else picture.layers._asdict()
+            write_image(outputs[i], np.asarray(picture.rgb), alpha, **depth, layers=named)
             frames.extend([np.asarray(picture.rgb)] if moving else [])
         if moving:
             write_animation(moving, frames, seconds=TURN)

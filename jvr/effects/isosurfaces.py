@@ -12,14 +12,15 @@ from jvr.march.first_hit import FINER, Hits, Reached, Search, leaving, next_hit,
 from jvr.march.medium import AbstractVisibility, Medium
 from jvr.march.occupancy import occupancy_of_values
 from jvr.march.steepest import steepest_of
-from jvr.march.steps import OnSurface, Point, Rays, points_at
+from jvr.march.steps import OnSurface, Point, Rays, Sample, points_at
 from jvr.model.bricks import Bricks
-from jvr.model.effects import AbstractSurfaces
+from jvr.model.effects import AbstractSurfaces, SurfaceLayers
 from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import Knob, PlanEntry, multiples
 from jvr.model.ranges import AT_LEAST_ONE, COLOUR, INCREASING, NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL, Interval
 from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
+from jvr.numerics import direction_and_length
 from jvr.types import ArrayLike, Scalar, Triple
 
 # Voxels along an edge of a brick that gradients are bounded in.
@@ -126,18 +127,37 @@ class Isosurfaces(AbstractSurfaces):
         return leaving(prepared, rays, hits, crosses)
 
     def shown(self, medium: Medium, rays: Rays, hits: Hits) -> tuple[Triple, Float[Array, "rays"]]:
-        own = lambda column: jnp.where(hits.found, column[hits.surface], 0.0)
-        colour = tuple(own(self.rgb[:, c]) for c in range(3))
-        opacity = hits.found.astype(rays.length.dtype) if self.opacity is None else own(self.opacity)
-        shader = medium.shader
-        if isinstance(shader, LitShader) and (shader.shading is not None or shader.environment is not None):
-            colour = _lit(shader, medium, rays, hits, colour, self.values[hits.surface])
-        return colour, opacity
+        colour = self._colour(hits)
+        opacity = hits.found.astype(rays.length.dtype) if self.opacity is None else _own(self.opacity, hits)
+        shader = _lit(medium.shader)
+        if shader is None:
+            return colour, opacity
+        factor, added, _ = _reflected(shader, medium, rays, hits, colour, self.values[hits.surface])
+        lit = tuple(c * a + b for c, a, b in zip(colour, factor, added, strict=True))
+        return tuple(jnp.where(hits.found, c, 0.0) for c in lit), opacity
+
+    def apart(self, medium: Medium, rays: Rays, hits: Hits) -> SurfaceLayers:
+        diffuse, shader, value = self._colour(hits), _lit(medium.shader), self.values[hits.surface]
+        if shader is None:
+            specular, sample = (jnp.zeros_like(hits.u),) * 3, _sampled(medium.shader, medium, rays, hits, value)[1]
+        else:
+            factor, specular, sample = _reflected(shader, medium, rays, hits, diffuse, value)
+            diffuse = tuple(map(jnp.multiply, diffuse, factor))
+        normal, steepness = direction_and_length(tuple(-g for g in sample.gradient))
+        return SurfaceLayers(normal, sample.s, steepness, diffuse, specular, sample.light.ambient)
 
     def shadowed(self, prepared: Search, scene: Scene, visible: AbstractVisibility | None) -> AbstractVisibility | None:
         if visible is None or scene.shadows is None or not self.casts_shadows:
             return visible
         return SurfaceShadows(visible, prepared, scene.clipping, scene.shadow_casters, self.opacity, self.most)
+
+    def _colour(self, hits: Hits) -> Triple:
+        return tuple(_own(self.rgb[:, c], hits) for c in range(3))
+
+
+def _own(column: Float[Array, "n"], hits: Hits) -> Float[Array, "rays"]:
+    """A number of each surface, of the one that rays hit; 0 where they hit none."""
+    return jnp.where(hits.found, column[hits.surface], 0.0)
 
 
 def hit_points(rays: Rays, hits: Hits) -> Point:
@@ -148,21 +168,35 @@ def hit_points(rays: Rays, hits: Hits) -> Point:
     return points_at(still, jnp.arange(zero.size, dtype=jnp.int32), zero, hits.u)
 
 
-def _lit(shader: LitShader, medium: Medium, rays: Rays, hits: Hits, colour: Triple, value: Float[Array, "rays"]) -> Triple:
-    """What surfaces of a colour reflect, with the isovalue of each."""
-    # A surface does not scatter as a medium does, and where it is cut there is none of it.
-    shader = LitShader(
-        shader.optical, shader.frame, shader.world_from_grid, shader.lights, shader.shading, None, None, shader.environment
-    )
-    there = lambda x: jnp.where(hits.found, x, 0.0)
+def _lit(shader: Any) -> LitShader | None:
+    """A shader that shades surfaces, or `None`."""
+    lit = isinstance(shader, LitShader) and (shader.shading is not None or shader.environment is not None)
+    return shader if lit else None
+
+
+def _sampled(shader: Any, medium: Medium, rays: Rays, hits: Hits, value: Float[Array, "rays"]) -> tuple[Point, Sample]:
+    """Where rays hit surfaces of isovalues, and what is known there in the world, with the light that reaches it."""
     point = hit_points(rays, hits)
     sample = jax.vmap(medium.field.resample)(point)
     sample = jax.vmap(shader.in_world, in_axes=(None, 0, 0))(medium.transfer, sample, point)
     if medium.visibility is not None:
         where = point._replace(surface=OnSurface(value, sample.gradient)) if sample.gradient else point
         sample = sample._replace(light=medium.visibility.transmittances(where, hits.found, reverse=True))
+    return point, sample
+
+
+def _reflected(
+    shader: LitShader, medium: Medium, rays: Rays, hits: Hits, colour: Triple, value: Float[Array, "rays"]
+) -> tuple[Triple, Triple, Sample]:
+    """What surfaces of a colour and an isovalue reflect of it, what they add in the colour of the light, and what is known where they
+    are."""
+    # A surface does not scatter as a medium does, and where it is cut there is none of it.
+    shader = LitShader(
+        shader.optical, shader.frame, shader.world_from_grid, shader.lights, shader.shading, None, None, shader.environment
+    )
+    point, sample = _sampled(shader, medium, rays, hits, value)
     classified = Classified(colour, (jnp.zeros_like(hits.u),))
     none = jnp.zeros((), hits.u.dtype)
     light_at = lambda sample, point, classified: shader.light_at(sample, point, classified, none, is_surface=True)
     factor, added = jax.vmap(light_at)(sample, point, classified)
-    return tuple(there(c * a + b) for c, a, b in zip(colour, factor, added, strict=True))
+    return factor, added, sample

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import warnings
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -132,6 +132,22 @@ class AbstractSurfaces(AbstractPart):
     def shadowed(self, prepared: Any, scene: Any, visible: Any) -> Any:
         """What reaches points of a scene's lights past the surfaces, as `AbstractPart.visibility`, where `visible` says what does of all
         light without them."""
+
+    @abc.abstractmethod
+    def apart(self, medium: Any, rays: Any, hits: Any) -> "SurfaceLayers":
+        """What `shown` is made of; anything finite where rays meet nothing."""
+
+
+class SurfaceLayers(NamedTuple):
+    """What is known of surfaces that rays meet: the normal, to the smaller values, the scalar, the length of its gradient, radiance towards
+    the eye in the colour of the surface and in that of the light, and how much of the ambient light reaches it."""
+
+    normal: Triple
+    value: Float[Array, "rays"]
+    gradient_length: Float[Array, "rays"]
+    diffuse: Triple
+    specular: Triple
+    occlusion: Channels
 
 
 class AbstractSpecular(AbstractPart):

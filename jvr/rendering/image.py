@@ -1,7 +1,7 @@
 """What a rendering gives: a picture, and what it took."""
 
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,6 +28,25 @@ class RenderStats(eqx.Module):
         return jnp.sum(getattr(self.sampling, "samples", self.steps))
 
 
+class Layers(NamedTuple):
+    """What is known of the first surface on each ray, `(height, width, channels)`; 0 where there is none.
+
+    - `position`: where it is, in the world; `normal`: unit length, to the smaller values; `value`: the scalar there; `gradient_length`:
+      that of its gradient, per world length.
+    - `diffuse`, `specular`: radiance towards the eye, in the colour of the surface and in that of the light; without light its colour
+      alone.
+    - `occlusion`: the fraction of ambient light that reaches it, 1 where nothing takes any; in what is diffuse already.
+    """
+
+    position: Float[Array, "height width 3"]
+    normal: Float[Array, "height width 3"]
+    value: Float[Array, "height width 1"]
+    gradient_length: Float[Array, "height width 1"]
+    diffuse: Float[Array, "height width 3"]
+    specular: Float[Array, "height width 3"]
+    occlusion: Float[Array, "height width channels"]
+
+
 class Rendering(eqx.Module):
     """A picture, row 0 at the top.
 
@@ -36,15 +55,18 @@ class Rendering(eqx.Module):
     - `depth`: `(height, width)`, `sum T (1 - exp(-dtau)) t / alpha`, distance from the eye along the ray, geometry included; 0 where alpha
       is 0.
     - `stats`: `RenderStats`.
+    - `layers`: `Layers` of a picture by `jvr.render_layers`, else `None`.
     """
 
     rgb: Image
     alpha: Float[Array, "height width"]
     depth: Float[Array, "height width"]
     stats: RenderStats
+    layers: Layers | None = None
 
     def save(self, path: str | os.PathLike, *, transparent: bool = False) -> None:
-        """Writes the picture: `.png` as sRGB, or `.exr` as linear radiance with the depth as channel Z.
+        """Writes the picture: `.png` as sRGB, or `.exr` as linear radiance with the depth as channel Z and its layers by their names, such
+        as `diffuse.R`, `normal.X` or `value.Y`.
 
         `transparent`: with alpha, for pictures of a scene without a background, whose `rgb` is light over black.
         **Raises** what `jvr.write_image` raises.
@@ -52,7 +74,8 @@ class Rendering(eqx.Module):
         from jvr.pictures import write_image
 
         is_exr = str(path).lower().endswith(".exr")
-        write_image(path, self.rgb, self.alpha if transparent else None, depth=self.depth if is_exr else None)
+        layers = {} if self.layers is None or not is_exr else self.layers._asdict()
+        write_image(path, self.rgb, self.alpha if transparent else None, depth=self.depth if is_exr else None, layers=layers)
 
     def _repr_png_(self) -> bytes:
         """What notebooks show; pixels that are not finite in magenta."""

@@ -79,10 +79,10 @@ def prepare(
     return Prepared(scene, dataclasses.replace(settings, step=1.0), dt, occupied, visible, lighting, search)
 
 
-def medium(prepared: Prepared) -> Medium:
-    """What of a scene rays march through: what the scene does not name is not in it."""
+def medium(prepared: Prepared, *, graded: bool = False) -> Medium:
+    """What of a scene rays march through: what the scene does not name is not in it. `graded`: with gradients, asked for or not."""
     scene, settings = prepared.scene, prepared.settings
-    frame, normals = _gradients(scene)
+    frame, normals = _gradients(scene, graded=graded)
     field = VoxelField(scene.volume, normals)
     quadrature = settings.quadrature
     pre_integrated = quadrature.pre_integrates
@@ -101,9 +101,9 @@ def _lighting() -> Any:
     return importlib.import_module(LIGHTING)
 
 
-def _gradients(scene: Scene) -> tuple[GradientFrame | None, AbstractNormals | None]:
-    """How gradients come about, where something asks for them."""
-    if not scene.needs_gradient:
+def _gradients(scene: Scene, *, graded: bool = False) -> tuple[GradientFrame | None, AbstractNormals | None]:
+    """How gradients come about, where something asks for them, or whoever calls."""
+    if not (scene.needs_gradient or graded):
         return None, None
     if scene.normals.of_opacity and scene.transfer.takes_gradient:
         raise ValueError("a transfer function of the gradient needs that of the scalar: set normals=...(of_opacity=False)")
