@@ -33,14 +33,14 @@ def mirrors() -> dict[str, Any]:
     for order in ORDERS:
         pictures[f"mirror_{order}"] = dataclasses.replace(opaque, specular=jvr.Specular(0.9, order=order))
         pictures[f"glass_{order}"] = dataclasses.replace(glass, specular=jvr.Specular(index=1.5, order=order))
-    functions = {name: lambda scene=scene: draw(scene) for name, scene in pictures.items()}
-    last = pictures["glass_2"]
+    functions: dict[str, Any] = {name: lambda scene=scene: draw(scene) for name, scene in pictures.items()}
+    last: Any = pictures["glass_2"]
     of_index = lambda index: jnp.mean(jvr.render(eqx.tree_at(lambda s: s.specular.index, last, index), camera, settings).rgb)
     gradient = jax.jit(jax.value_and_grad(of_index))
     functions["index"] = lambda: gradient(last.specular.index)
     times = processor_seconds(functions)
     over = lambda a, b: statistics.median(x / y for x, y in zip(times[a], times[b], strict=True))
-    held = gradient.lower(last.specular.index).compile().memory_analysis()
+    held: Any = gradient.lower(last.specular.index).compile().memory_analysis()
     return {
         **{f"{name}_seconds": statistics.median(found) for name, found in times.items()},
         **{f"mirror_{order}_over_opaque": over(f"mirror_{order}", "opaque") for order in ORDERS},

@@ -40,7 +40,7 @@ def occlusion() -> dict[str, Any]:
     look = jax.jit(lambda scene: scene.occlusion.visibility(scene, lambda graded: absorbing(scene, None, graded)))
     shaded = dataclasses.replace(hit, occlusion=jvr.SurfaceOcclusion(RAYS))
     drawn = {"plain": plain, "local": kept["local"], "hit": hit, "surface": shaded}
-    functions = {name: lambda scene=scene: draw(scene) for name, scene in drawn.items()}
+    functions: dict[str, Any] = {name: lambda scene=scene: draw(scene) for name, scene in drawn.items()}
     functions["transfer"] = lambda: look(kept["histogram"])
     times = processor_seconds(functions)
     over = lambda a, b: statistics.median(x / y for x, y in zip(times[a], times[b], strict=True))

@@ -56,7 +56,7 @@ class Study(NamedTuple):
     silhouettes."""
 
     name: str
-    scene: jvr.Scene
+    scene: Any
     cameras: tuple[jvr.PerspectiveCamera, ...]
     slope: float
     silhouettes: list[np.ndarray]
@@ -125,7 +125,7 @@ def disturbed(study: Study) -> tuple[jvr.Scene, list[jvr.PerspectiveCamera]]:
     return dataclasses.replace(study.scene, surfaces=surfaces, shading=jvr.BlinnPhong(*START)), cameras
 
 
-def unknowns(scene: jvr.Scene, cameras: Any) -> Any:
+def unknowns(scene: Any, cameras: Any) -> Any:
     shading: Any = scene.shading
     poses = [camera.world_from_camera for camera in cameras]
     return scene.surfaces.values, (shading.diffuse, shading.specular, shading.shininess), poses

@@ -21,7 +21,7 @@ from jvr.effects.local_histograms import (
     ray_samples,
     shell_of,
 )
-from jvr.effects.nodes import CHUNK, AbstractProjection
+from jvr.effects.nodes import AbstractProjection
 from jvr.effects.occlusion import OcclusionVisibility, darkness_at_voxels, nodes_along, occlusion_visibility, resolutions
 from jvr.effects.short_rays import Reach, short_rays
 from jvr.march.medium import DENSEST, LightPath, Medium
@@ -220,14 +220,25 @@ class HistogramProjection(AbstractProjection):
         positions = node_positions(volume, shape)
         some = np.random.default_rng(0).permutation(len(positions))[:TAUGHT]
         samples = lambda p: ray_samples(volume, bins, short_rays(volume, clipping, occlusion.rays, p), reach)
-        chunks = jnp.asarray(np.resize(positions[some], (-(-len(some) // CHUNK), min(CHUNK, len(some)), 3)))
+        chunks = jnp.asarray(np.resize(positions[some], (-(-len(some) // cls.chunk), min(cls.chunk, len(some)), 3)))
         taught = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0).reshape(x.shape[1], -1), jax.lax.map(samples, chunks))
         features = features_of(taught, occlusion.shells)
         # Halves are not equal, so that it takes a few more to tell few rays apart.
         levels = min((occlusion.clusters - 1).bit_length(), features.shape[0].bit_length() + SPARE)
         tree = grown(features, levels)
         weights = mean_histograms(taught, tree.find(features), 2**levels, occlusion.shells, occlusion.bins)
-        return cls(volume, clipping, medium, reach, bins, tree, weights, occlusion.rays, occlusion.shells, shape)
+        return cls(
+            volume=volume,
+            clipping=clipping,
+            medium=medium,
+            reach=reach,
+            bins=bins,
+            tree=tree,
+            weights=weights,
+            rays=occlusion.rays,
+            shells=occlusion.shells,
+            nodes_along=shape,
+        )
 
     @property
     def shape(self) -> Shape:

@@ -66,4 +66,5 @@ def channel_count(medium: Medium, volume: Volume, rays: SecondaryRays) -> int:
 
 def points(p: Triple, along: Triple) -> Point:
     """Grid positions that belong to no march."""
-    return Point(p, along, *(jnp.zeros_like(p[0], jnp.int32),) * 2)
+    zero = jnp.zeros_like(p[0], jnp.int32)
+    return Point(p, along, zero, zero)
