@@ -141,7 +141,8 @@ def fitted(study: Study, images: list[np.ndarray], weights: list[np.ndarray] | N
     ends = np.array([poses_apart(a, b, center) for a, b in zip(found.cameras, study.cameras, strict=True)])
     level_error, reflectance_errors, poses = found.standard_errors
     sure = np.array(poses)
-    level = float(found.scene.surfaces.values[0] - study.scene.surfaces.values[0])
+    surfaces: Any = found.scene.surfaces
+    level = float(surfaces.values[0] - study.scene.surfaces.values[0])
     return {
         "isovalue": level / study.slope,
         "isovalue_error": float(level_error[0]) / study.slope,
