@@ -31,6 +31,8 @@ from jvr.types import Channels, Scalar
 
 # Length of a step along the near piece, in voxels of the smallest spacing.
 STEP = 1.0
+# How far from a corner of the volume a line is taken to touch it, in voxels of the smallest spacing.
+TOUCHING = 1e-3
 
 
 class PiecewiseShadows(AbstractShadows):
@@ -140,8 +142,9 @@ class BeyondProjection(AbstractProjection):
         """At grid positions. Where nothing is left, that where the way ends, its limit."""
         origin = tuple(c.astype(self.reach.dtype) for c in p.T)
         ways = ways_to(light, self.volume, self.clipping, origin)
-        # From a node where the volume is cut away the line to the light may leave what is left of it behind the node, or miss it.
-        hit = ways.end > ways.begin
+        # From a node where the volume is cut away the line to the light may leave what is left of it behind the node, or miss it. That
+        # from an edge of the volume touches it, by a rounding.
+        hit = ways.end >= ways.begin - TOUCHING * jnp.min(self.volume.spacing)
         end = jnp.where(hit, ways.end, 0.0)
         begin = smaller(larger(jnp.where(hit, larger(ways.begin, 0.0), 0.0), self.reach), end)
         fractions = (jnp.arange(self.samples, dtype=end.dtype) + 0.5) / self.samples
