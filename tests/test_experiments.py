@@ -19,7 +19,6 @@ from experiments import (
     pose_recovery,
     relight,
     shadowed_fit,
-    surface_fit,
     tomography,
 )
 from jvr.io.config import build_fit, build_scene, read_config
@@ -233,16 +232,3 @@ def test_voxels_are_found_beside_other_methods(monkeypatch, tmp_path):
     assert all(found[method, 8] > found[method, 4] for method in ("FBP", "SART"))
     assert {row["method"] for row in result["colours"]} == {"no prior", "Tikhonov", "TV", "TV, coarse to fine"}
     assert all(row["held_out"] > 15 for row in result["colours"])
-
-
-@pytest.mark.slow
-def test_a_surface_is_found_in_pictures_of_two_renderers(monkeypatch, tmp_path):
-    result, size = ran(surface_fit, monkeypatch, tmp_path)
-    assert size > 10_000
-    # Double against single precision, at pixels whose rays meet the same cells.
-    assert result["renderers"]["rms_inside"] < 1e-3
-    for row in result["derivatives"].values():
-        assert row["missing_inside"] < 0.3 < row["missing_at_silhouettes"]
-    for row in result["fits"]:
-        assert abs(row["isovalue"]) < 0.4
-        assert row["voxels"] < 0.7

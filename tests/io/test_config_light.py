@@ -128,7 +128,8 @@ TABLE = "{positions=[0.1,0.9],values=[0.2,0.4]}"
     ],
 )
 def test_a_part_is_a_name_or_a_table(key, text, wanted):
-    assert same(getattr(scene_of(LIT + "[[lights]]\nkind = 'ambient'\n", f"{key}={text}"), key), wanted)
+    around = "[[lights]]\nkind = 'ambient'\n[surfaces]\nvalues = [0.5]\nrgb = [[1, 1, 1]]\n"
+    assert same(getattr(scene_of(LIT + around, f"{key}={text}"), key), wanted)
 
 
 @pytest.mark.parametrize(

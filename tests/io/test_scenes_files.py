@@ -178,6 +178,12 @@ SCENES = {
     "natural": lambda: natural(radiance_transfer=jvr.RadianceTransfer(exact=True)),
     "occluded": lambda: lit(lights=[jvr.AmbientLight()], occlusion=jvr.LocalOcclusion(8, radius=2, samples=3, bias=0.1)),
     "histograms": histograms,
+    "hollows": lambda: lit(
+        lights=[jvr.AmbientLight()],
+        surfaces=jvr.Isosurfaces([0.4], [[0.9, 0.5, 0.2]]),
+        occlusion=jvr.SurfaceOcclusion(8, 5, factor=2.0, tilt=0.2, cosine=True, softness=0.3),
+    ),
+    "in-scattering": lambda: lit(shadows=jvr.InScattering(8, radius=2, bias=0.1, direct=jvr.PiecewiseShadows(3, 0.5))),
     "glass": lambda: scene(
         surfaces=jvr.Isosurfaces((0.4, 0.6), voxels((2, 3)), (0.3, 1.0)), specular=jvr.Specular([0.2, 0.7], 1.4, order=1)
     ),

@@ -255,7 +255,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "SingleScattering": {"threshold": 0.5},
     "SobelDifferences": {},
     "SpotLight": {"position": [0.0, 0.0, 1.0], "direction": [0.0, 0.0, -1.0], "attenuation": [1.0, 0.5, 0.5]},
-    "SurfaceOcclusion": {"softness": 0.1},
+    "SurfaceOcclusion": {"factor": 2.0, "softness": 0.1},
     "TabulatedPhase": {"angles": [0.0, 1.0, np.pi], "values": [1.0, 0.5, 0.2]},
     "Volume": {"values": np.zeros((2, 2, 2), np.float32)},
 }
