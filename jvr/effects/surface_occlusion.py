@@ -2,7 +2,6 @@
 GPU-based volume ray-casting, Eurographics 2009, chapter 5 and listing 9.5).
 """
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jvr.effects.short_rays import GOLDEN
 from jvr.march.medium import AbstractVisibility, LightPath
 from jvr.march.secondary import secondary_rays
 from jvr.march.steps import OnSurface, Point, Transmittances
@@ -23,9 +23,6 @@ from jvr.model.scene import Scene
 from jvr.model.volume import Volume
 from jvr.numerics import clamp, direction_and_length, dot, larger, rounded_into, turned
 from jvr.types import ArrayLike, Scalar, Triple
-
-# Azimuth between one direction and the next, the golden angle.
-GOLDEN = math.pi * (3 - math.sqrt(5))
 
 
 class SurfaceOcclusion(AbstractOcclusion):

@@ -93,12 +93,12 @@ def node_positions(volume: Volume, shape: Shape) -> Float[np.ndarray, "nodes 3"]
 
 
 def fractions_at_voxels(
-    volume: Volume, nodes: Float[Array, "nodes channels"], resolution: float, *, least: float = 0.0
+    volume: Volume, nodes: Float[Array, "nodes channels"], resolution: float
 ) -> Float[Array, "x y z channels"]:
-    """Fractions of light at all nodes, from `least` to 1, on the grid of the voxels: straight lines between nodes would let light into
-    whatever is not much thicker than they are apart."""
+    """Fractions of light at all nodes, 0 ... 1, on the grid of the voxels: straight lines between nodes would let light into whatever is
+    not much thicker than they are apart."""
     coarse = nodes.reshape(*node_shape(volume, resolution), -1)
-    return jnp.clip(resampled_cubic(coarse, volume.shape), least, 1.0)
+    return jnp.clip(resampled_cubic(coarse, volume.shape), 0.0, 1.0)
 
 
 def nodes_for_each_voxel(volume: Volume, shape: Shape) -> tuple[float, float, float]:
