@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, UInt32
 from jvr.effects.grid import Grid
 from jvr.effects.nodes import AbstractProjection, project_all, seen_around, surfaces_of, visible_nodes
 from jvr.effects.piecewise_shadows import PiecewiseShadows
-from jvr.effects.short_rays import Reach, mean_light, short_rays, sources_of_rays
+from jvr.effects.short_rays import Reach, knobs_of_rays, mean_light, short_rays, sources_of_rays
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.secondary import points as points_of
 from jvr.march.steps import Point, Transmittances
@@ -95,14 +95,7 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
         self.projected = None
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
-        # Of what has been computed beforehand nothing can be saved.
-        if self.is_frozen:
-            return ()
-        return (
-            multiples("rays", self.rays, (1 / 4, 1 / 2, 1), 4, least=1),
-            multiples("samples", self.samples, (1 / 4, 1 / 2, 1), 2, least=1),
-            multiples("resolution", self.resolution, (1 / 2, 1), 2, most=1.0),
-        )
+        return knobs_of_rays(self, multiples("resolution", self.resolution, (1 / 2, 1), 2, most=1.0))
 
     @property
     def stale_message(self) -> str:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, UInt32
 
 from jvr.effects.grid import Grid
 from jvr.effects.nodes import AbstractProjection, seen_around, surfaces_of, visible_nodes
-from jvr.effects.short_rays import Reach, mean_light, short_rays, sources_of_rays
+from jvr.effects.short_rays import Reach, knobs_of_rays, mean_light, short_rays, sources_of_rays
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
 from jvr.march.steps import Point, Transmittances
 from jvr.model.clipping import Clipping
@@ -114,14 +114,7 @@ class LocalOcclusion(AbstractNodeOcclusion):
         self.projected = None
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
-        # Of what has been computed beforehand nothing can be saved.
-        if self.is_frozen:
-            return ()
-        return (
-            multiples("rays", self.rays, (1 / 4, 1 / 2, 1), 4, least=1),
-            multiples("samples", self.samples, (1 / 4, 1 / 2, 1), 2, least=1),
-            resolutions(self, scene.volume),
-        )
+        return knobs_of_rays(self, resolutions(self, scene.volume))
 
     @property
     def stale_message(self) -> str:

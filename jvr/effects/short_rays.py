@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jvr.march.medium import Medium
 from jvr.march.secondary import SecondaryRays, channel_count, secondary_rays, take_midpoint
 from jvr.model.clipping import Clipping
+from jvr.model.parts import Knob, multiples
 from jvr.model.scene import Scene
 from jvr.model.transfer import Classified
 from jvr.model.volume import Volume
@@ -53,6 +54,17 @@ def short_rays(volume: Volume, clipping: Clipping, number: int, p: Float[Array, 
     along = tuple(jnp.tile(jnp.asarray(d, dtype), p.shape[0]) for d in _sphere(number).T)
     grid = origin, volume.grid_from_world(along, direction=True)
     return secondary_rays(volume, clipping, (volume.world_from_point(origin), along), grid)
+
+
+def knobs_of_rays(part: Any, resolution: Knob) -> tuple[Knob, ...]:
+    """The knobs of a part with `rays` and `samples` at nodes; of what has been computed beforehand none, since nothing can be saved."""
+    if part.is_frozen:
+        return ()
+    return (
+        multiples("rays", part.rays, (1 / 4, 1 / 2, 1), 4, least=1),
+        multiples("samples", part.samples, (1 / 4, 1 / 2, 1), 2, least=1),
+        resolution,
+    )
 
 
 def _sphere(rays: int) -> Float[np.ndarray, "rays 3"]:
