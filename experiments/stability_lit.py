@@ -205,6 +205,11 @@ def placed_rows(quick: bool) -> dict[str, list[Case]]:
     hidden = hidden._replace(scene=dataclasses.replace(hidden.scene, clipping=box))
     # Equal voxels but for a noise.
     noisy = lambda noise: 0.5 * (1 + noise * np.random.default_rng(0).standard_normal(SHAPE))
+    missing_data = base(values=unknown, extinction=(0.0, 0.5, 0.3, 0.6), world=np.eye(4), label="-3.4e38")
+    if quick:
+        # A box around everything: the program of the row before.
+        everything = jvr.ClippingBox([-99.0] * 3, [99.0] * 3)
+        missing_data = missing_data._replace(scene=dataclasses.replace(missing_data.scene, clipping=everything))
     labels = placed(label="two labels")
     volume = jvr.Volume((smooth() > 0.5).astype(np.uint8), oblique(), interpolation=jvr.Nearest())
     labels = labels._replace(scene=dataclasses.replace(labels.scene, volume=volume), kink=True)
@@ -222,7 +227,7 @@ def placed_rows(quick: bool) -> dict[str, list[Case]]:
         ],
         "labels": [labels],
         "voxel (0, 0, 0) is NaN, and clipped": [hidden],
-        "no data: voxels of -3.4e38": [base(values=unknown, extinction=(0.0, 0.5, 0.3, 0.6), world=np.eye(4), label="-3.4e38")],
+        "no data: voxels of -3.4e38": [missing_data],
         "spot of 0.01 ... 60 degrees": [base(world=np.eye(4), lights=spot(a), label=f"{a:g}") for a in pick([0.01, 1.0, 60.0])],
     }
 
@@ -249,21 +254,24 @@ def environment_rows(quick: bool) -> dict[str, list[Case]]:
     """Hard cases of environment lighting."""
     depths = (1.0, 1e8) if quick else (0.0, 1e-6, 1.0, 1e2, 1e4, 1e8)
     rough = (0.05, 1.0) if quick else (0.01, 0.05, 0.2, 1.0)
-    exact = lambda **settings: jvr.RadianceTransfer(3, 8, 1.0, exact=True, **settings)
-    bleeds = jvr.RadianceTransfer(3, 8, 1.0, bleeding=jvr.MaterialBleeding())
+    # Each choice of the exact product and each order has programs of its own, which grow with the order.
+    order = 1 if quick else 3
+    exact = lambda **settings: jvr.RadianceTransfer(order, 8, 1.0, exact=True, **settings)
+    bleeds = jvr.RadianceTransfer(order, 8, 1.0, bleeding=jvr.MaterialBleeding())
+    surfaces = {"alpha 0": exact(surface=1e-6), "alpha 90 degrees": exact(surface=1e6)}
+    usual = surfaces["alpha 0"] if quick else exact()
     return {
         "transfer: optical depth 0 ... 1e8, shortcut": [under_environment(sigma=f, label=f"{f:g}") for f in depths],
         "transfer: optical depth 0 ... 1e8, exact": [
-            under_environment(sigma=f, transfer=exact(), label=f"{f:g}") for f in depths
+            under_environment(order=order, sigma=f, transfer=usual, label=f"{f:g}") for f in depths
         ],
         "transfer: material bleeding, order 0 and 3": [
-            under_environment(transfer=bleeds, label="3"),
+            under_environment(order=order, transfer=bleeds, label=f"{order}"),
             under_environment(order=0, transfer=jvr.RadianceTransfer(0, 8, 1.0), label="0"),
         ],
         "transfer: no gradient, all gradient": [
             under_environment(values=np.full(SHAPE, 0.5), label="constant"),
-            under_environment(transfer=exact(surface=1e-6), label="alpha 0"),
-            under_environment(transfer=exact(surface=1e6), label="alpha 90 degrees"),
+            *(under_environment(order=order, transfer=transfer, label=label) for label, transfer in surfaces.items()),
         ],
         "microfacets: roughness 0.01 ... 1": [
             under_environment(material=jvr.MicrofacetBRDF(roughness=r), label=f"{r:g}") for r in rough

@@ -17,7 +17,7 @@ GRADIENT = 1e-3
 
 
 # Structures of scenes among the hard cases, each with programs of its own.
-STRUCTURES = 13
+STRUCTURES = 11
 
 
 @pytest.fixture(scope="module")

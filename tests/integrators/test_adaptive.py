@@ -409,14 +409,14 @@ def test_gradients_against_differences_with_the_placement_frozen(x64, optical):
         p["transfer"] = linear_transfer(coloured=True)
     # Where nothing attenuates emission, a smaller tolerance leaves out less than a fifth of the samples.
     distances = ask(jvr.LocalError(0.03), jvr.Volume(p["voxels"], OBLIQUE), p["transfer"], optical, jnp.asarray(40.0))
-    value = jax.jit(lambda p: loss(p, distances, optical))
-    gradient, stats = jax.jit(jax.grad(lambda p: loss(p, distances, optical), has_aux=True))(p)
+    both = jax.jit(jax.value_and_grad(lambda p: loss(p, distances, optical), has_aux=True))
+    (_, stats), gradient = both(p)
     assert int(stats.samples[0]) < 0.8 * int(stats.full)
     assert np.all(np.asarray(stats.samples) > 0)
     for name in p:
         along, h = random_like(p[name]), 1e-6
         moved = [{**p, name: jax.tree.map(lambda x, d, t=t: x + t * d, p[name], along)} for t in (h, -h)]
-        (high, more), (low, less) = map(value, moved)
+        (high, more), (low, less) = (both(q)[0] for q in moved)
         np.testing.assert_array_equal(more.samples, stats.samples, err_msg=name)
         np.testing.assert_array_equal(less.samples, stats.samples, err_msg=name)
         found = sum(jnp.vdot(g, d) for g, d in zip(jax.tree.leaves(gradient[name]), jax.tree.leaves(along), strict=True))
