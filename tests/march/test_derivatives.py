@@ -76,7 +76,7 @@ def central_differences(loss, p, h=1e-6):
     flat = np.concatenate([np.ravel(x) for x in leaves])
     split = lambda v: jax.tree.unflatten(structure, [a.reshape(x.shape) for a, x in zip(jnp.split(v, ends), leaves, strict=True)])
     moved = np.concatenate([flat + h * np.eye(flat.size), flat - h * np.eye(flat.size)])
-    above, below = jnp.split(jax.jit(lambda v: jax.lax.map(lambda x: loss(split(x)), v, batch_size=64))(moved), 2)
+    above, below = jnp.split(jax.jit(lambda v: jax.lax.map(lambda x: loss(split(x)), v))(moved), 2)
     return split((above - below) / (2 * h))
 
 

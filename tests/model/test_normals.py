@@ -288,32 +288,27 @@ def test_gradient_of_a_shaded_picture(scheme, of_opacity, x64):
     flat, unravel = jax.flatten_util.ravel_pytree(p)
     of = lambda v: lit(unravel(v)["values"], normals, unravel(v)["transfer"], adjoint=jvr.Forward())
     h = 1e-6 * np.eye(flat.size)
-    above, below = jnp.split(jax.jit(lambda v: jax.lax.map(of, v, batch_size=32))(flat + np.concatenate([h, -h])), 2)
+    above, below = jnp.split(jax.jit(lambda v: jax.lax.map(of, v))(flat + np.concatenate([h, -h])), 2)
     expected = unravel((above - below) / 2e-6)
     for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(gradient), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6 * np.abs(b).max(), err_msg=jax.tree_util.keystr(path))
 
 
-@pytest.mark.parametrize(
-    ("scheme", "threshold"),
-    [
-        (jvr.AnalyticGradient, 0.0),
-        *(pytest.param(s, 0.1, marks=pytest.mark.slow) for s in (jvr.AnalyticGradient, jvr.SobelDifferences)),
-        pytest.param(jvr.SobelDifferences, 0.0, marks=pytest.mark.slow),
-    ],
-)
-def test_a_vanishing_gradient_has_no_normal_and_no_nan(scheme, threshold):
+@pytest.mark.parametrize("scheme", [jvr.AnalyticGradient, pytest.param(jvr.SobelDifferences, marks=pytest.mark.slow)])
+def test_a_vanishing_gradient_has_no_normal_and_no_nan(scheme):
     """A constant volume: no surface, so that the picture is that of light that is faced, an unlit one of colours as dark as the material,
     with derivatives in both modes."""
     values, transfer = jnp.full((4, 5, 6), 0.5), linear_transfer()
     normals = scheme()
-    for shading in (jvr.BlinnPhong(threshold=threshold),):
-        value, gradient = jax.jit(jax.value_and_grad(lambda v, s=shading: lit(v, normals, transfer, s)))(values)
-        plain = jax.jit(lambda v: unlit(v, eqx.tree_at(lambda t: t.rgb, transfer, 0.7 * transfer.rgb)))(values)
+    plain = jax.jit(lambda v: unlit(v, eqx.tree_at(lambda t: t.rgb, transfer, 0.7 * transfer.rgb)))(values)
+    reverse = jax.jit(jax.value_and_grad(lambda v, shading: lit(v, normals, transfer, shading)))
+    along = lambda v, shading: jax.jvp(lambda v: lit(v, normals, transfer, shading, jvr.Forward()), (v,), (jnp.ones_like(v),))
+    forward = jax.jit(along)
+    for threshold in (0.0, 0.1):
+        value, gradient = reverse(values, jvr.BlinnPhong(threshold=threshold))
         np.testing.assert_allclose(value, plain, rtol=1e-6)
         assert np.isfinite(gradient).all()
-        forward = functools.partial(lit, normals=normals, transfer=transfer, shading=shading, adjoint=jvr.Forward())
-        tangent = jax.jit(lambda v, t, f=forward: jax.jvp(f, (v,), (t,))[1])(values, jnp.ones_like(values))
+        tangent = forward(values, jvr.BlinnPhong(threshold=threshold))[1]
         np.testing.assert_allclose(tangent, np.sum(gradient), rtol=1e-4)
 
 
@@ -389,7 +384,7 @@ def test_derivatives_of_a_transfer_of_the_gradient(kind, x64):
     gradient = jax.jit(jax.grad(lambda p: loss(p, jvr.Replay())))(p)
     flat, unravel = jax.flatten_util.ravel_pytree(p)
     h = 1e-6 * np.eye(flat.size)
-    of = lambda v: jax.lax.map(lambda x: loss(unravel(x), jvr.Forward()), v, batch_size=32)
+    of = lambda v: jax.lax.map(lambda x: loss(unravel(x), jvr.Forward()), v)
     above, below = jnp.split(jax.jit(of)(flat + np.concatenate([h, -h])), 2)
     for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(unravel((above - below) / 2e-6)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6 * np.abs(b).max())
