@@ -47,7 +47,7 @@ class Scene(AbstractPart):
     - `clipping`: what is left of the volume: `jvr.ClippingBox`, `jvr.ClippingPlane`, several of them in a row, or `None`: all of it.
     - `lights`: any number of `jvr.DirectionalLight`, `jvr.PointLight`, `jvr.SpotLight`, `jvr.HeadLight`, `jvr.AmbientLight` and
       `jvr.EnvironmentLight`.
-    - `shading`: what surfaces make of light: `jvr.Lambert`, `jvr.Phong`, `jvr.BlinnPhong`,
+    - `shading`: what surfaces make of light: `jvr.Lambert`, `jvr.Phong`, `jvr.BlinnPhong`, `jvr.AnisotropicGGX`,
       `jvr.PhenomenologicalBSDF`, or `None`: the medium glows as it is.
     - `shadows`: how much of each light reaches a point: `jvr.ShadowRays`, `jvr.ShadowVolume`, `jvr.ShadowMap`, `jvr.OpacityShadowMap`,
       `jvr.DeepShadowMap`, `jvr.PiecewiseShadows`, `jvr.InScattering` around any of them, or `None`: all of it.

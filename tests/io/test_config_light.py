@@ -278,6 +278,12 @@ def test_a_transfer_function_of_the_gradient_survives_a_file_bit_by_bit(transfer
         ("scattering={albedo=1.5}", "scattering.albedo", "in [0, 1]"),
         ("scattering={albedo='high'}", "scattering.albedo", "a table with positions and values"),
         ("scattering={albedo={positions=[0,1],values=[1,2]}}", "scattering.albedo.values", "entry 1 must be in [0, 1]"),
+        (
+            "scattering={albedo={kind='gradient',positions=[0,1],values=[1,2]}}",
+            "scattering.albedo.values",
+            "entry 1 must be in [0, 1]",
+        ),
+        ("scattering={albedo={kind='gradint',positions=[0],values=[1]}}", "scattering.albedo.kind", "did you mean 'gradient'?"),
         ("scattering={threshold=0}", "scattering.threshold", "positive"),
         ("scattering={phase='rayliegh'}", "scattering.phase", "did you mean 'rayleigh'?"),
         ("scattering={phase='schlick'}", "scattering.phase.k", "missing"),
