@@ -124,12 +124,16 @@ class AnisotropicGGX(Lambert):
         steep = dot(normal, d)
         tangent = tuple(a - steep * n for a, n in zip(d, normal, strict=True))
         along, across = (jnp.square(jnp.square(roughness)) for roughness in (self.roughness_along, self.roughness_across))
-        return _Facets(normal, tangent, along, across, along * dot(tangent, tangent) + across * jnp.square(steep))
+        rougher = along > across
+        # No absolute value, whose derivative is lost where both are the same; nor products of which then the derivative has to cancel.
+        excess = jnp.where(rougher, along - across, across - along)
+        in_plane = jnp.where(rougher, across + excess * dot(tangent, tangent), along + excess * jnp.square(steep))
+        return _Facets(normal, tangent, across, in_plane, rougher, excess)
 
 
 class _Facets(NamedTuple):
-    """Microfacets on a surface: its normal, the direction's projection on it, and `alpha^2` along the direction, across it, and along
-    the projection.
+    """Microfacets on a surface: its normal, the direction's projection on it, `alpha^2` across the direction and along the projection,
+    whether they are rougher along than across, and by how much of `alpha^2` these differ.
 
     Forms of M are sums of positive terms, of which none is divided by the length of the projection: with `p` the projection and
     `q = n x p`, `(v . p)^2 + (v . q)^2 = |p|^2 |n x v|^2` and `alpha_t^2 - alpha_across^2 = (alpha_along^2 - alpha_across^2) |p|^2`.
@@ -137,38 +141,32 @@ class _Facets(NamedTuple):
 
     normal: Triple
     tangent: Triple
-    along: Scalar
     across: Scalar
     in_plane: Numbers
+    rougher: Bool[Array, ""]
+    excess: Scalar
 
     def density(self, h: Triple) -> Numbers:
         """`D`, per area and solid angle."""
-        rougher = self.along > self.across
         flat, sine, p, q = self._parts(h)
         # No product of squares under a quotient or a root: that of two mirrors leaves float32 in derivatives.
-        ratio = self._excess / self.in_plane / self.across
-        slopes = sine / jnp.where(rougher, self.in_plane, self.across) + ratio * jnp.square(jnp.where(rougher, q, p))
+        ratio = self.excess / self.in_plane / self.across
+        slopes = sine / jnp.where(self.rougher, self.in_plane, self.across) + ratio * jnp.square(jnp.where(self.rougher, q, p))
         peak = 1 / (jnp.sqrt(jnp.sqrt(self.in_plane) * jnp.sqrt(self.across)) * (slopes + jnp.square(flat)))
         return peak * peak / math.pi
 
     def root(self, v: Triple) -> Numbers:
         """`root(v)` of masking and shadowing."""
-        rougher = self.along > self.across
         flat, sine, p, q = self._parts(v)
-        least = jnp.where(rougher, self.across, self.in_plane)
-        return jnp.sqrt(least * sine + self._excess * jnp.square(jnp.where(rougher, p, q)) + jnp.square(flat))
+        least = jnp.where(self.rougher, self.across, self.in_plane)
+        return jnp.sqrt(least * sine + self.excess * jnp.square(jnp.where(self.rougher, p, q)) + jnp.square(flat))
 
     def stretched(self, v: Triple) -> Triple:
         """The root of M times what of `v` lies in the surface, and the rest of `v`: the map from a hemisphere's normals to these."""
         flat, across = dot(self.normal, v), jnp.sqrt(self.across)
-        more = (self.along - self.across) / (jnp.sqrt(self.in_plane) + across) * dot(self.tangent, v)
+        more = jnp.where(self.rougher, self.excess, -self.excess) / (jnp.sqrt(self.in_plane) + across) * dot(self.tangent, v)
         parts = zip(v, self.normal, self.tangent, strict=True)
         return tuple(across * (c - flat * n) + more * t + flat * n for c, n, t in parts)
-
-    @property
-    def _excess(self) -> Scalar:
-        # No absolute value, whose derivative is lost where both are the same.
-        return jnp.where(self.along > self.across, self.along - self.across, self.across - self.along)
 
     def _parts(self, v: Triple) -> tuple[Numbers, Numbers, Numbers, Numbers]:
         """The cosine to the normal, the square of the sine, `v . p` and `v . q`."""

@@ -20,7 +20,7 @@ import math
 import types
 import typing
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeAlias, TypeVar
+from typing import Any, ClassVar, ParamSpec, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -46,7 +46,7 @@ class AbstractByScalar(eqx.Module):
 
     values: eqx.AbstractVar[Any]
     # Whether it asks for the gradient.
-    needs_gradient: eqx.AbstractClassVar[bool]
+    needs_gradient: ClassVar[bool]
 
     @abc.abstractmethod
     def at_sample(self, s: Any, magnitude: Any) -> Any:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from directions import chance, histogram, towards, triple
-from scenes import render
+from scenes import perspective, render
 
 import jvr
 
@@ -182,6 +182,27 @@ def test_pictures_show_the_lobe():
         lobe = np.pi * 0.5 * reference(towards(0), light, covariance(direction, 0.3, 0.8))
         found = render(scene, camera, jvr.Settings(0.5)).rgb[0, 0, 0]
         np.testing.assert_allclose(found, 0.5 * 0.4 * light[2] + lobe, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_fit_finds_fibres():
+    """Their direction, up to its sign, and both roughnesses, from pictures of a ball."""
+    x = np.arange(12) - 5.5
+    ball = 6.0 - np.sqrt(sum(np.square(x).reshape(np.roll((12, 1, 1), k)) for k in range(3)))
+    transfer = jvr.LinearTransfer([0.0, 1.0, 6.0], np.full((3, 3), 0.6), [0.0, 3.0, 3.0])
+    lights = (jvr.DirectionalLight([1.0, -0.5, -0.6]), jvr.DirectionalLight([-0.4, 0.9, -0.7], [0.4, 0.7, 0.9]))
+    of = lambda direction, *roughness: jvr.Scene(
+        jvr.Volume(ball), transfer, lights=lights, shading=jvr.AnisotropicGGX(direction, 0.0, 0.4, 0.5, *roughness)
+    )
+    truth, start = of((0.6, 0.0, 0.8), 0.35, 0.8), of((0.0, 0.2, 1.0), 0.6, 0.6)
+    cameras = [perspective(truth.volume, 12, 12, direction=d) for d in ((1, -0.6, 0.4), (-0.3, 1, 0.5), (-0.8, -0.7, 0.1))]
+    settings = jvr.Settings(0.5)
+    images = [render(truth, camera, settings).rgb for camera in cameras]
+    unknowns = lambda s: (s.shading.direction, s.shading.roughness_along, s.shading.roughness_across)
+    found = jvr.fit(start, cameras, images, unknowns=unknowns, settings=settings).scene.shading
+    direction = np.asarray(found.direction) / np.linalg.norm(found.direction)
+    np.testing.assert_allclose(direction * np.sign(direction[2]), [0.6, 0.0, 0.8], atol=1e-3)
+    np.testing.assert_allclose([found.roughness_along, found.roughness_across], [0.35, 0.8], atol=1e-3)
 
 
 def test_numbers_out_of_range_are_refused():

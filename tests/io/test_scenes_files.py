@@ -69,7 +69,9 @@ def shells() -> jvr.Scene:
 
 
 def fibres() -> jvr.Scene:
-    return lit(shading=jvr.AnisotropicGGX((0.3, 0.4, -1), 0.1, 0.5, jvr.ByGradient([0.1, 0.9], [0.2, 0.7]), 0.3, by_value(0.5, 1)))
+    return lit(
+        shading=jvr.AnisotropicGGX((0.3, 0.4, -1), 0.1, 0.5, jvr.ByGradient([0.1, 0.9], [0.2, 0.7]), 0.3, by_value(0.5, 1))
+    )
 
 
 def phases() -> jvr.Scene:

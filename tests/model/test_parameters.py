@@ -447,7 +447,12 @@ def test_fits_keep_to_what_is_declared(name):
 def test_the_reference_says_what_is_declared():
     found = public_parameters()
     g, *_ = found["HenyeyGreenstein"]
-    assert (g.name, g.shape, g.range, g.default) == ("g", "() or (3,) or jvr.ByValue or jvr.ByGradient", "between -1 and 1, without either", "")
+    assert (g.name, g.shape, g.range, g.default) == (
+        "g",
+        "() or (3,) or jvr.ByValue or jvr.ByGradient",
+        "between -1 and 1, without either",
+        "",
+    )
     diameter = found["JendersieEon"][0]
     assert (diameter.range, diameter.unit) == ("in [5, 50]", "micrometres")
     assert {e.name: e.default for e in found["ShadowRays"]} == {"step": "1", "termination": "0.001"}
