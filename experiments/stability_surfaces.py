@@ -115,8 +115,8 @@ def surface_rows(quick: bool) -> dict[str, list[Case]]:
             glowing(emission, sigma) for emission in pick([1e-8, 1.0, 1e8]) for sigma in (0.0, 1.0)
         ],
         "fibres along and ending on surfaces, roughness 0.05 ... 1": [
-            fibrous(*roughness, direction)
-            for roughness in pick([(0.05, 0.05), (0.05, 1.0), (1.0, 0.05), (0.5, 0.5), (1.0, 1.0)])
+            fibrous(along, across, direction)
+            for along, across in pick([(0.05, 0.05), (0.05, 1.0), (1.0, 0.05), (0.5, 0.5), (1.0, 1.0)])
             for direction in ((0.0, 0.0, 1.0), (1.0, 1e-6, 0.0), (0.6, 0.0, 0.8))
         ],
         "sky with a lamp 1e4 times as bright": [under_a_lamp(factor) for factor in pick([1.0, 1e4])],
