@@ -60,6 +60,18 @@ def under_a_lamp(factor: float) -> Case:
     return case._replace(scene=dataclasses.replace(case.scene, shading=None, scattering=None, **parts))
 
 
+def fibrous(along: float, across: float, direction: Any) -> Case:
+    """A volume whose scalar rises along z, under lights of which one is mirrored to the eye."""
+    to_eye = (EYE - MIDDLE) / np.linalg.norm(EYE - MIDDLE)
+    lights = (jvr.DirectionalLight(to_eye * [1, 1, -1]), jvr.DirectionalLight([0.5, 0.4, -0.6], [0.6, 0.8, 0.5]))
+    case = base(values=np.indices(SHAPE)[2] / TOP, world=np.eye(4), shadows=None, lights=lights, camera=(EYE, MIDDLE))
+    # By the gradient, all of one length here.
+    specular = jvr.ByGradient([0.1, 0.2], [0.2, 0.5])
+    shading = jvr.AnisotropicGGX(direction, 0.1, 0.5, specular, along, across)
+    scene = dataclasses.replace(case.scene, scattering=None, shading=shading)
+    return case._replace(scene=scene, label=f"{along:g}, {across:g}, {direction}")
+
+
 def surface_rows(quick: bool) -> dict[str, list[Case]]:
     """Hard cases of surfaces and of what is around them."""
     pick = lambda values: values[:: max(1, len(values) - 1)] if quick else values
@@ -101,6 +113,11 @@ def surface_rows(quick: bool) -> dict[str, list[Case]]:
         ],
         "emission 1e-8 ... 1e8, without extinction and with": [
             glowing(emission, sigma) for emission in pick([1e-8, 1.0, 1e8]) for sigma in (0.0, 1.0)
+        ],
+        "fibres along and ending on surfaces, roughness 0.05 ... 1": [
+            fibrous(along, across, direction)
+            for along, across in pick([(0.05, 0.05), (0.05, 1.0), (1.0, 0.05), (0.5, 0.5), (1.0, 1.0)])
+            for direction in ((0.0, 0.0, 1.0), (1.0, 1e-6, 0.0), (0.6, 0.0, 0.8))
         ],
         "sky with a lamp 1e4 times as bright": [under_a_lamp(factor) for factor in pick([1.0, 1e4])],
     }

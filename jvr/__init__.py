@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from jvr.names import NAMES
 
 if TYPE_CHECKING:
+    from jvr.effects.anisotropic import AnisotropicGGX as AnisotropicGGX
     from jvr.effects.deep_shadow_map import DeepShadowMap as DeepShadowMap
     from jvr.effects.histogram_occlusion import HistogramOcclusion as HistogramOcclusion
     from jvr.effects.in_scattering import InScattering as InScattering
@@ -81,6 +82,7 @@ if TYPE_CHECKING:
     from jvr.model.brdf import LambertBRDF as LambertBRDF
     from jvr.model.brdf import PhaseBRDF as PhaseBRDF
     from jvr.model.brdf import PhongBRDF as PhongBRDF
+    from jvr.model.by_value import ByGradient as ByGradient
     from jvr.model.by_value import ByValue as ByValue
     from jvr.model.camera import OrthographicCamera as OrthographicCamera
     from jvr.model.camera import PerspectiveCamera as PerspectiveCamera

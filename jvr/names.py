@@ -25,6 +25,7 @@ class Renamed:
 
 
 NAMES = {
+    "jvr.effects.anisotropic": ("AnisotropicGGX",),
     "jvr.effects.deep_shadow_map": ("DeepShadowMap",),
     "jvr.effects.histogram_occlusion": ("HistogramOcclusion",),
     "jvr.effects.in_scattering": ("InScattering",),
@@ -75,7 +76,7 @@ NAMES = {
     "jvr.march.differentiation": ("Forward", "Replay", "Rows"),
     "jvr.march.quadrature": ("Midpoint", "PreIntegrated"),
     "jvr.model.brdf": ("BlinnPhongBRDF", "LambertBRDF", "PhaseBRDF", "PhongBRDF"),
-    "jvr.model.by_value": ("ByValue",),
+    "jvr.model.by_value": ("ByGradient", "ByValue"),
     "jvr.model.camera": ("OrthographicCamera", "PerspectiveCamera", "PinholeCamera", "fibonacci_sphere", "orbit"),
     "jvr.model.clipping": ("ClippingBox", "ClippingPlane"),
     "jvr.model.dipole": ("Dipole",),

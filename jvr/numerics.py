@@ -176,6 +176,11 @@ def dot(a: Triple, b: Triple) -> Float[Array, "..."]:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def cross(a: Triple, b: Triple) -> Triple:
+    """Outer product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
 def perpendicular(axis: Triple) -> tuple[Triple, Triple]:
     """Two unit vectors that make an orthonormal basis with a unit vector (Duff et al. 2017, JCGT 6:1)."""
     x, y, z = axis

@@ -19,7 +19,7 @@ from jvr.effects.self_shadow import ShadedSegment
 from jvr.effects.shading import surface_weight
 from jvr.march.shaders import GradientFrame, OpticalShader, PreIntegratedShader, where_known
 from jvr.march.steps import Point, Sample
-from jvr.model.by_value import at_value
+from jvr.model.by_value import at_sample
 from jvr.model.clipping import parts_of_clipping
 from jvr.model.effects import AbstractScattering, AbstractShading
 from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
@@ -70,8 +70,8 @@ class LitShader(OpticalShader):
         zero = jnp.zeros_like(sample.s)
         x = transformed(self.world_from_grid, point.p)
         w_o, _ = direction_and_length(turned(-self.world_from_grid[:3, :3], point.direction))
-        shading, scattering = at_value((self.shading, self.scattering), sample.s)
         normal, magnitude = direction_and_length(tuple(-g for g in sample.gradient)) if sample.gradient else ((zero,) * 3, zero)
+        shading, scattering = at_sample((self.shading, self.scattering), sample.s, magnitude)
         surface = zero if shading is None else shading.surface_weight(magnitude)
         cut = zero
         if is_surface:

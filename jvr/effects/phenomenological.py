@@ -17,13 +17,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jvr.effects.shading import surface_weight
-from jvr.model.by_value import ByValue
 from jvr.model.dielectric import mirrored, refracted
 from jvr.model.effects import AbstractShading
-from jvr.model.parameters import assign, choice, parameter
+from jvr.model.lobes import sample_about, upright
+from jvr.model.parameters import AbstractByScalar, assign, choice, parameter
 from jvr.model.parts import is_zero
 from jvr.model.ranges import NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL
-from jvr.numerics import divide_or_zero, dot, perpendicular, power_of_cosine
+from jvr.numerics import divide_or_zero, dot, power_of_cosine
 from jvr.types import ArrayLike, Scalar, Triple
 
 Numbers = Float[Array, "..."]
@@ -37,9 +37,9 @@ class PhenomenologicalBSDF(AbstractShading):
 
     **Arguments:**
 
-    - `k_d`, `k_s`, `k_t`: shares of the three lobes, 0 ... 1, numbers or `jvr.ByValue`. With a sum of at most 1 no more leaves than
-      arrives.
-    - `s`, `q`: exponents of the specular and of the transmissive lobe, not negative, numbers or `jvr.ByValue`.
+    - `k_d`, `k_s`, `k_t`: shares of the three lobes, 0 ... 1, numbers, `jvr.ByValue` or `jvr.ByGradient`. With a sum of at most 1 no
+      more leaves than arrives.
+    - `s`, `q`: exponents of the specular and of the transmissive lobe, not negative; as the shares.
     - `index`: refractive index of what has the larger values over that of what has the smaller ones, positive, or `None`: straight on.
     - `normalised`: lobes are scaled to reflect, or let through, their share of all light from everywhere, `k_s (s + 1) / 2` and
       `k_t (q + 1) / 2`; else they are the notes' to the letter.
@@ -63,11 +63,11 @@ class PhenomenologicalBSDF(AbstractShading):
 
     def __init__(
         self,
-        k_d: ArrayLike | ByValue = 0.5,
-        k_s: ArrayLike | ByValue = 0.2,
-        k_t: ArrayLike | ByValue = 0.3,
-        s: ArrayLike | ByValue = 30.0,
-        q: ArrayLike | ByValue = 10.0,
+        k_d: ArrayLike | AbstractByScalar = 0.5,
+        k_s: ArrayLike | AbstractByScalar = 0.2,
+        k_t: ArrayLike | AbstractByScalar = 0.3,
+        s: ArrayLike | AbstractByScalar = 30.0,
+        q: ArrayLike | AbstractByScalar = 10.0,
         index: ArrayLike | None = None,
         *,
         normalised: bool = True,
@@ -96,7 +96,7 @@ class PhenomenologicalBSDF(AbstractShading):
 
     def value(self, w_o: Triple, w_i: Triple) -> Numbers:
         """`f_r + f_t`, per solid angle."""
-        sides = _sides(_up(w_o), w_o, self.index, False)
+        sides = _sides(upright(w_o), w_o, self.index, False)
         specular, let_through = self._lobes(sides, w_i, normalised=True)
         return (self.k_d * jnp.maximum(w_i[2], 0.0) + specular + let_through) / math.pi
 
@@ -107,7 +107,7 @@ class PhenomenologicalBSDF(AbstractShading):
     def sample(self, w_o: Triple, u: Triple) -> tuple[Triple, Bool[Array, "..."]]:
         """A direction for three numbers in [0, 1), and whether it is on the side of its lobe; the weight `value / pdf` is `k_d + k_s + k_t`
         where it is, and 0 where it is not. Detached: which lobe is taken."""
-        sides = _sides(_up(w_o), w_o, self.index, False)
+        sides = _sides(upright(w_o), w_o, self.index, False)
         chosen = u[0] * self.ambient_reflectance()
         diffuse, through = chosen < self.k_d, chosen >= self.k_d + self.k_s
         passes = through & ~sides.total
@@ -116,7 +116,7 @@ class PhenomenologicalBSDF(AbstractShading):
             for n, r, t in zip(sides.normal, sides.mirrored, sides.onward, strict=True)
         )
         exponent = jnp.where(diffuse, 1.0, jnp.where(through, self.q, self.s))
-        w_i = _about(axis, exponent, u[1], u[2])
+        w_i = sample_about(axis, exponent, u[1], u[2])
         return w_i, jnp.where(passes, w_i[2] < 0, w_i[2] > 0)
 
     def _lobes(self, sides: "_Sides", w_i: Triple, *, normalised: bool) -> tuple[Numbers, Numbers]:
@@ -146,18 +146,3 @@ def _sides(normal: Triple, w_o: Triple, index: Scalar | None, inside: Bool[Array
         return _Sides(normal, mirror, tuple(-o for o in w_o), jnp.zeros_like(mirror[0], bool))
     behind = refracted(normal, w_o, jnp.where(inside, index, 1 / index))
     return _Sides(normal, mirror, behind.direction, behind.total)
-
-
-def _up(like: Triple) -> Triple:
-    """The normal of a surface in its own frame."""
-    zero = jnp.zeros_like(like[2])
-    return zero, zero, zero + 1
-
-
-def _about(axis: Triple, exponent: Numbers, u: Numbers, v: Numbers) -> Triple:
-    """A direction with the density `(e + 1) / (2 pi) cos^e` about an axis (notes, equation 8.22)."""
-    cosine = jnp.power(1 - u, 1 / (exponent + 1))
-    sine = jnp.sqrt(jnp.maximum((1 - cosine) * (1 + cosine), 0.0))
-    across, up = perpendicular(axis)
-    x, y = sine * jnp.cos(2 * math.pi * v), sine * jnp.sin(2 * math.pi * v)
-    return tuple(cosine * a + x * b + y * c for a, b, c in zip(axis, across, up, strict=True))

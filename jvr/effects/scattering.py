@@ -5,9 +5,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from jvr.effects.shading import surface_weight
-from jvr.model.by_value import ByValue
 from jvr.model.effects import AbstractScattering
-from jvr.model.parameters import GREY_OR_RGB, assign, parameter
+from jvr.model.parameters import GREY_OR_RGB, AbstractByScalar, assign, parameter
 from jvr.model.parts import is_zero
 from jvr.model.phase import AbstractPhase, Isotropic, ScatteringAngle
 from jvr.model.ranges import POSITIVE, UNIT_INTERVAL
@@ -19,8 +18,9 @@ class SingleScattering(AbstractScattering):
 
     **Arguments:**
 
-    - `phase`: a phase function, such as `jvr.HenyeyGreenstein(g)`; a `jvr.ByValue` as its `g` makes it depend on the scalar.
-    - `albedo`: fraction of extinguished light that is scattered, 0 ... 1; a number, `(3,)`, or `jvr.ByValue`.
+    - `phase`: a phase function, such as `jvr.HenyeyGreenstein(g)`; a `jvr.ByValue` as its `g` makes it depend on the scalar, a
+      `jvr.ByGradient` on the length of its gradient.
+    - `albedo`: fraction of extinguished light that is scattered, 0 ... 1; a number, `(3,)`, `jvr.ByValue` or `jvr.ByGradient`.
     - `threshold`: with one, light is scattered where the gradient is weak and reflected (`Scene(shading=...)`) where it is strong (notes,
       section 7.4.4): with a gradient of length `m` the fraction `threshold^2 / (m^2 + threshold^2)` scatters, and what remains
       reflects. `None`: everything scatters, surface or not.
@@ -35,7 +35,7 @@ class SingleScattering(AbstractScattering):
     def __init__(
         self,
         phase: AbstractPhase = Isotropic(),
-        albedo: ArrayLike | ByValue = 1.0,
+        albedo: ArrayLike | AbstractByScalar = 1.0,
         *,
         threshold: ArrayLike | None = None,
     ):

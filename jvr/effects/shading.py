@@ -12,10 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jvr.model.by_value import ByValue
 from jvr.model.effects import AbstractShading
 from jvr.model.lobes import about_half_way, about_mirrored
-from jvr.model.parameters import assign, choice, parameter
+from jvr.model.parameters import AbstractByScalar, assign, choice, parameter
 from jvr.model.parts import is_zero
 from jvr.model.ranges import AT_LEAST_ONE, NOT_NEGATIVE
 from jvr.numerics import divide_or_zero, dot, larger, smaller
@@ -32,7 +31,8 @@ class Lambert(AbstractShading):
 
     **Arguments:**
 
-    - `ambient`, `diffuse`: numbers, not negative, or `jvr.ByValue` for a material by scalar.
+    - `ambient`, `diffuse`: numbers, not negative, or `jvr.ByValue` for a material by scalar, `jvr.ByGradient` for one by the length
+      of its gradient.
     - `threshold`: length of the gradient (data units per world length) of half a surface: a point with a gradient of length `m` is one
       by the weight `m^2 / (m^2 + threshold^2)`; the rest of it reflects as if it faced the light, so that homogeneous regions are not
       shaded as surfaces. 0: whatever has a gradient is a surface.
@@ -48,8 +48,8 @@ class Lambert(AbstractShading):
 
     def __init__(
         self,
-        ambient: ArrayLike | ByValue = 1.0,
-        diffuse: ArrayLike | ByValue = 1.0,
+        ambient: ArrayLike | AbstractByScalar = 1.0,
+        diffuse: ArrayLike | AbstractByScalar = 1.0,
         *,
         threshold: ArrayLike = 0.0,
         two_sided: bool = True,
@@ -87,7 +87,8 @@ class Lambert(AbstractShading):
 class Phong(Lambert):
     """Specular (Phong) surfaces: Lambert's, and `specular E max(r . w_o, 0)^shininess` in the colour of the light, `r` the mirrored light.
 
-    **Arguments:** as `Lambert`, and `specular`, not negative; `shininess`, at least 1. Each a number or `jvr.ByValue`.
+    **Arguments:** as `Lambert`, and `specular`, not negative; `shininess`, at least 1. Each a number, `jvr.ByValue` or
+    `jvr.ByGradient`.
     """
 
     specular: Any = reflected("share of the light in the highlight")
@@ -95,10 +96,10 @@ class Phong(Lambert):
 
     def __init__(
         self,
-        ambient: ArrayLike | ByValue = 0.1,
-        diffuse: ArrayLike | ByValue = 0.7,
-        specular: ArrayLike | ByValue = 0.3,
-        shininess: ArrayLike | ByValue = 30.0,
+        ambient: ArrayLike | AbstractByScalar = 0.1,
+        diffuse: ArrayLike | AbstractByScalar = 0.7,
+        specular: ArrayLike | AbstractByScalar = 0.3,
+        shininess: ArrayLike | AbstractByScalar = 30.0,
         *,
         threshold: ArrayLike = 0.0,
         two_sided: bool = True,
@@ -117,10 +118,10 @@ class BlinnPhong(Phong):
     # Written out because type checkers take a dataclass's fields for its arguments where it has no constructor of its own.
     def __init__(
         self,
-        ambient: ArrayLike | ByValue = 0.1,
-        diffuse: ArrayLike | ByValue = 0.7,
-        specular: ArrayLike | ByValue = 0.3,
-        shininess: ArrayLike | ByValue = 30.0,
+        ambient: ArrayLike | AbstractByScalar = 0.1,
+        diffuse: ArrayLike | AbstractByScalar = 0.7,
+        specular: ArrayLike | AbstractByScalar = 0.3,
+        shininess: ArrayLike | AbstractByScalar = 30.0,
         *,
         threshold: ArrayLike = 0.0,
         two_sided: bool = True,

@@ -30,6 +30,7 @@ from jvr.model.light import AbstractLight
 from jvr.model.material import AbstractBRDF
 from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbstractOpticalModel
+from jvr.model.parameters import AbstractByScalar
 from jvr.model.phase import AbstractPhase
 from jvr.model.transfer import AbstractTransfer
 from jvr.names import NAMES
@@ -55,7 +56,9 @@ KINDS: dict[type, dict[str, str]] = {
         "phong": "Phong",
         "blinn-phong": "BlinnPhong",
         "phenomenological": "PhenomenologicalBSDF",
+        "anisotropic": "AnisotropicGGX",
     },
+    AbstractByScalar: {"value": "ByValue", "gradient": "ByGradient"},
     AbstractShadows: {
         "rays": "ShadowRays",
         "volume": "ShadowVolume",

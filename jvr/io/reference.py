@@ -85,6 +85,6 @@ def _entry(field: dataclasses.Field, default: Any) -> Entry:
     else:
         values, is_array = about.within.words, True
     shapes = [str(shape).replace("'", "") for shape in shapes_of(field)] if is_array else []
-    shape = " or ".join([*shapes, *(["jvr.ByValue"] if about.by_scalar else [])])
+    shape = " or ".join([*shapes, *(["jvr.ByValue", "jvr.ByGradient"] if about.by_scalar else [])])
     said = "" if default is inspect.Parameter.empty else f"{default:g}" if isinstance(default, float) else repr(default)
     return Entry(field.name, shape, values, about.unit, said, about.doc, about.hint)

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jvr.model.by_value import is_varying
 from jvr.model.lobes import about_half_way, about_mirrored
 from jvr.model.material import AbstractBRDF, SymmetryAxis
 from jvr.model.parameters import GREY_OR_RGB, assign, parameter
@@ -115,6 +116,10 @@ class PhaseBRDF(AbstractBRDF):
     albedo: Float[Array, "..."] = share()
 
     def __init__(self, phase: AbstractPhase, albedo: ArrayLike = 1.0):
+        if is_varying(phase):
+            raise ValueError(
+                "a material has one phase function: take jvr.MaterialByValue(positions, materials) for one by the scalar"
+            )
         assign(self, phase=phase, albedo=albedo)
 
     def evaluate(self, w_o: Triple, w_i: Triple) -> tuple[Channels, Channels]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, UInt32
 from numpy import ndarray
 
 from jvr.model.kept import content, is_same_content
-from jvr.model.parts import AbstractPart, PlanEntry, spelling
+from jvr.model.parts import AbstractPart, PlanEntry, asks_gradient, spelling
 from jvr.names import Renamed
 from jvr.types import Channels, Scalar, Triple
 
@@ -22,7 +22,7 @@ class AbstractBSDF(AbstractPart):
     """How light that arrives at a point is sent on to the eye: by surfaces and by the medium, of lights and of the environment."""
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        asked = {"lights": self.shows_lights, "environment": self.shows_environment, "gradient": self.needs_gradient}
+        asked = {"lights": self.shows_lights, "environment": self.shows_environment, "gradient": asks_gradient(self)}
         return (PlanEntry(name, True, spelling(self), tuple(what for what, is_asked in asked.items() if is_asked)),)
 
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jvr.model.by_value import at_most
 from jvr.model.checks import float_array, radiances, require
 from jvr.model.exact import Exact, Remainder, in_double
 from jvr.model.parameters import GREY_OR_RGB, assign, declared, parameter
@@ -226,7 +227,7 @@ class AmbientLight(AbstractLight):
 
     def remarks(self, name: str, scene: Any, stats: Any) -> Iterator[str]:
         yield from super().remarks(name, scene, stats)
-        reflects = scene.shading is not None and not is_zero(scene.shading.ambient_reflectance())
+        reflects = scene.shading is not None and not is_zero(at_most(scene.shading).ambient_reflectance())
         if scene.shows_lights and scene.scattering is None and not reflects:
             yield f"{self.title(name, scene)} is not seen: shading.ambient is zero"
 

@@ -19,7 +19,7 @@ from jvr.model.geometry import AbstractGeometry
 from jvr.model.parameters import assign, parameter
 from jvr.model.parts import PlanEntry
 from jvr.model.ranges import RADIANCE
-from jvr.numerics import dot
+from jvr.numerics import cross, dot
 from jvr.types import ArrayLike, Triple
 
 # Triangles in a block, and rays that look at a block together.
@@ -131,17 +131,13 @@ def _meet(corners: tuple[Triple, ...], rays: Line) -> tuple[Float[Array, "..."],
     first, second, third = corners
     minus = lambda a, b: tuple(x - y for x, y in zip(a, b, strict=True))
     side, other, offset = minus(second, first), minus(third, first), minus(origin, first)
-    p, q = _cross(direction, other), _cross(offset, side)
+    p, q = cross(direction, other), cross(offset, side)
     volume = dot(side, p)
     flat = volume == 0
     inverse = jnp.where(flat, 0.0, 1.0 / jnp.where(flat, 1.0, volume))
     u, v = dot(offset, p) * inverse, dot(direction, q) * inverse
     weights = tuple(jnp.where(flat, -1.0, w) for w in (1 - u - v, u, v))
     return dot(other, q) * inverse, weights
-
-
-def _cross(a: Triple, b: Triple) -> Triple:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def _through_box(lower: Triple, upper: Triple, rays: Line) -> tuple[Float[Array, "rays"], Float[Array, "rays"]]:

@@ -92,7 +92,12 @@ def ggx(h: Triple, alpha: Scalar) -> Numbers:
 def visibility(cos_o: Numbers, cos_i: Numbers, alpha: Scalar) -> Numbers:
     """Masking and shadowing over `4 cos_o cos_i`, times `cos_i`: `cos_i / (2 (cos_i root(cos_o) + cos_o root(cos_i)))` with
     `root(c)^2 = alpha^2 + (1 - alpha^2) c^2`; both cosines positive."""
-    return divide_or_zero(0.5 * cos_i, cos_i * _root(cos_o, alpha) + cos_o * _root(cos_i, alpha))
+    return smith(cos_o, _root(cos_o, alpha), cos_i, _root(cos_i, alpha))
+
+
+def smith(cos_o: Numbers, root_o: Numbers, cos_i: Numbers, root_i: Numbers) -> Numbers:
+    """The same of given roots."""
+    return divide_or_zero(0.5 * cos_i, cos_i * root_o + cos_o * root_i)
 
 
 def reflectances(alpha: Scalar) -> tuple[Float[Array, "m"], Float[Array, "m"], Float[Array, "m"]]:

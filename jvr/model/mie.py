@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jvr.model.by_value import ByValue
 from jvr.model.checks import require
-from jvr.model.parameters import GREY_OR_RGB, assign, parameter
+from jvr.model.parameters import GREY_OR_RGB, AbstractByScalar, assign, parameter
 from jvr.model.phase import (
     AbstractPhase,
     Numbers,
@@ -42,7 +41,7 @@ class Draine(AbstractPhase):
     g: Any = asymmetry()
     alpha: Numbers = parameter(NOT_NEGATIVE, shapes=GREY_OR_RGB, doc="0 for Henyey-Greenstein")
 
-    def __init__(self, g: ArrayLike | ByValue, alpha: ArrayLike):
+    def __init__(self, g: ArrayLike | AbstractByScalar, alpha: ArrayLike):
         assign(self, g=g, alpha=alpha)
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:

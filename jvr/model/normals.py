@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jvr.model.interpolation import Nearest, Trilinear
 from jvr.model.parameters import choice
-from jvr.model.parts import AbstractPart, Knob, PlanEntry, parts_of, spelling
+from jvr.model.parts import AbstractPart, Knob, PlanEntry, asks_gradient, parts_of, spelling
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume, gradients_at_voxels, smoothed
 from jvr.names import Renamed
@@ -36,7 +36,7 @@ class AbstractNormals(AbstractPart):
     prepared = Renamed("with_gradients")
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        asking = " and ".join(other for other, part in parts_of(scene) if part.needs_gradient)
+        asking = " and ".join(other for other, part in parts_of(scene) if asks_gradient(part))
         reason = f"{spelling(self)}, asked for by {asking}" if asking else "nothing asks for a gradient"
         return (PlanEntry("gradient", bool(asking), reason),)
 

@@ -12,6 +12,7 @@ From it come the constructor's check (`assign`), what a fit keeps an array to (`
 configuration (`jvr.io.config.schema.parts`), how it is saved and loaded, and the reference (`jvr.io.reference`).
 """
 
+import abc
 import dataclasses
 import functools
 import inspect
@@ -19,7 +20,7 @@ import math
 import types
 import typing
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeAlias, TypeVar
+from typing import Any, ClassVar, ParamSpec, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -40,9 +41,16 @@ TAKE = {"": float_array, "colour": colours, "radiance": radiances}
 
 
 class AbstractByScalar(eqx.Module):
-    """A coefficient that depends on the scalar, in the place of a number: its `values` are in that number's range."""
+    """A coefficient that depends on the scalar or on the length of its gradient, in the place of a number: its `values` are in that
+    number's range."""
 
     values: eqx.AbstractVar[Any]
+    # Whether it asks for the gradient.
+    needs_gradient: ClassVar[bool]
+
+    @abc.abstractmethod
+    def at_sample(self, s: Any, magnitude: Any) -> Any:
+        """The number at a sample: the scalar `s`, with a gradient of length `magnitude`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,8 +60,9 @@ class Parameter:
     - `within`: the values that it takes.
     - `doc`: what it is, in a few words that errors and the reference show; `unit`: of its numbers; `hint`: a value to begin with.
     - `shapes`: of its array; `None`: as the annotation says.
-    - `by_scalar`: whether a `jvr.ByValue` may stand in its place. The field is then annotated `Any`: it holds the one or the other, while
-      methods along a ray see numbers alone (`jvr.model.by_value.at_value`), which no annotation of one field says to a type checker.
+    - `by_scalar`: whether a `jvr.ByValue` or a `jvr.ByGradient` may stand in its place. The field is then annotated `Any`: it holds the one
+      or the other, while methods along a ray see numbers alone (`jvr.model.by_value.at_sample`), which no annotation of one field says to
+      a type checker.
     - `by_channel`: whether, where the last axis is colour, each of its channels acts on that channel of a picture alone, as those of light
       do. A fit then takes one forward derivative for all three.
     - `ordered`: whether entries along the first axis follow each other by value, so that what lies between two of them is meant to be

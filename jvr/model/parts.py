@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jvr.model.by_value import ByValue
+from jvr.model.by_value import is_by_gradient
+from jvr.model.parameters import AbstractByScalar
 
 
 class PlanEntry(NamedTuple):
@@ -117,6 +118,11 @@ def parts_of(whole: Any) -> Iterator[tuple[str, AbstractPart]]:
         yield from ((own, part) for own, part in named if isinstance(part, AbstractPart))
 
 
+def asks_gradient(part: AbstractPart) -> bool:
+    """Whether a part, or a coefficient in it, asks for the gradient at each sample of a ray."""
+    return part.needs_gradient or is_by_gradient(part)
+
+
 def with_part(whole: Any, name: str, part: AbstractPart) -> Any:
     """A scene or settings with another part in the place of that name. **Raises** `ValueError` where there is none to replace."""
     if name not in dict(parts_of(whole)):
@@ -154,5 +160,5 @@ def spelling(part: Any) -> str:
 
 def is_zero(value: Any) -> bool:
     """Whether nothing of a number, of an array or of a value by scalar differs from zero."""
-    array = value.values if isinstance(value, ByValue) else value
+    array = value.values if isinstance(value, AbstractByScalar) else value
     return array is not None and not np.any(np.asarray(array))

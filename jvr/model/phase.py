@@ -16,9 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jvr.model.by_value import ByValue
 from jvr.model.checks import require
-from jvr.model.parameters import GREY_OR_RGB, assign, parameter
+from jvr.model.parameters import GREY_OR_RGB, AbstractByScalar, assign, parameter
 from jvr.model.ranges import ASYMMETRY, NOT_NEGATIVE, UNIT_INTERVAL
 from jvr.numerics import divide_or_zero, dot, perpendicular
 from jvr.types import ArrayLike, Channels, Scalar, Triple
@@ -158,12 +157,13 @@ def sample_henyey_greenstein(g: Numbers, u: Numbers) -> ScatteringAngle:
 class HenyeyGreenstein(AbstractPhase):
     """The Henyey-Greenstein phase function of asymmetry `g`, see `henyey_greenstein`; forward for `g > 0`, isotropic for `g = 0`.
 
-    **Arguments:** `g`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either; differentiable. **Raises** `ValueError` otherwise.
+    **Arguments:** `g`: `()`, `(3,)`, `jvr.ByValue` or `jvr.ByGradient`, between -1 and 1 without either; differentiable. **Raises**
+    `ValueError` otherwise.
     """
 
     g: Any = asymmetry("mean cosine: -1 backward, 0 even, 1 forward")
 
-    def __init__(self, g: ArrayLike | ByValue):
+    def __init__(self, g: ArrayLike | AbstractByScalar):
         assign(self, g=g)
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
@@ -188,7 +188,7 @@ class DoubleHenyeyGreenstein(AbstractPhase):
     g2: Any = asymmetry()
     weight: Numbers = parameter(UNIT_INTERVAL, shapes=GREY_OR_RGB, doc="share of the first lobe")
 
-    def __init__(self, g1: ArrayLike | ByValue, g2: ArrayLike | ByValue, weight: ArrayLike):
+    def __init__(self, g1: ArrayLike | AbstractByScalar, g2: ArrayLike | AbstractByScalar, weight: ArrayLike):
         assign(self, g1=g1, g2=g2, weight=weight)
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:
@@ -216,13 +216,14 @@ class Schlick(AbstractPhase):
     """Schlick's phase function, `p = (1 - k^2) / (4 pi (1 - k cos theta)^2)` (Blasi, Le Saec and Schlick 1993), which needs no square root.
 
     It resembles Henyey-Greenstein for `k = 1.55 g - 0.55 g^3` (Pharr and Humphreys 2004).
-    **Arguments:** `k`: `()`, `(3,)` or `jvr.ByValue`, between -1 and 1 without either, forward for `k > 0`; differentiable.
+    **Arguments:** `k`: `()`, `(3,)`, `jvr.ByValue` or `jvr.ByGradient`, between -1 and 1 without either, forward for `k > 0`;
+    differentiable.
     **Raises** `ValueError` otherwise.
     """
 
     k: Any = asymmetry()
 
-    def __init__(self, k: ArrayLike | ByValue):
+    def __init__(self, k: ArrayLike | AbstractByScalar):
         assign(self, k=k)
 
     def evaluate(self, angle: ScatteringAngle) -> Channels:

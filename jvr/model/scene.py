@@ -7,6 +7,7 @@ from typing import Any
 
 import equinox as eqx
 
+from jvr.model.by_value import is_by_gradient
 from jvr.model.clipping import AbstractClipping, ClippingBox
 from jvr.model.effects import (
     AbstractMaterial,
@@ -27,7 +28,7 @@ from jvr.model.light import AbstractDeltaLight, AbstractLight, AmbientLight
 from jvr.model.normals import AbstractNormals, AnalyticGradient
 from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
 from jvr.model.parameters import assign, parameter
-from jvr.model.parts import AbstractPart, PlanEntry, parts_of
+from jvr.model.parts import AbstractPart, PlanEntry, asks_gradient, parts_of
 from jvr.model.ranges import COLOUR
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
@@ -46,7 +47,7 @@ class Scene(AbstractPart):
     - `clipping`: what is left of the volume: `jvr.ClippingBox`, `jvr.ClippingPlane`, several of them in a row, or `None`: all of it.
     - `lights`: any number of `jvr.DirectionalLight`, `jvr.PointLight`, `jvr.SpotLight`, `jvr.HeadLight`, `jvr.AmbientLight` and
       `jvr.EnvironmentLight`.
-    - `shading`: what surfaces make of light: `jvr.Lambert`, `jvr.Phong`, `jvr.BlinnPhong`,
+    - `shading`: what surfaces make of light: `jvr.Lambert`, `jvr.Phong`, `jvr.BlinnPhong`, `jvr.AnisotropicGGX`,
       `jvr.PhenomenologicalBSDF`, or `None`: the medium glows as it is.
     - `shadows`: how much of each light reaches a point: `jvr.ShadowRays`, `jvr.ShadowVolume`, `jvr.ShadowMap`, `jvr.OpacityShadowMap`,
       `jvr.DeepShadowMap`, `jvr.PiecewiseShadows`, `jvr.InScattering` around any of them, or `None`: all of it.
@@ -183,7 +184,7 @@ class Scene(AbstractPart):
 
     @property
     def needs_gradient(self) -> bool:
-        return any(part.needs_gradient for _, part in parts_of(self))
+        return any(asks_gradient(part) for _, part in parts_of(self))
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         return () if self.background_colour is None else (PlanEntry("background", True, "shows through"),)
@@ -259,6 +260,8 @@ def _check_light(scene: Scene) -> None:
         )
     if scene.occlusion is not None and scene.occlusion.of_surfaces and scene.shading is None:
         raise ValueError("surfaces show no ambient light without a shading: set shading=jvr.Lambert()")
+    if scene.normals.of_opacity and is_by_gradient((scene.shading, scene.scattering)):
+        raise ValueError("jvr.ByGradient goes by the gradient of the scalar: set normals=...(of_opacity=False)")
 
 
 def _check_environment(scene: Scene) -> None:

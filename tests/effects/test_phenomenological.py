@@ -6,18 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.stats
+from directions import chance, histogram, towards, triple
 from scenes import render
 
 import jvr
 
 LOBES = {"diffuse": (0.6, 0.0, 0.0), "specular": (0.0, 0.7, 0.0), "transmissive": (0.0, 0.0, 0.8), "all": (0.3, 0.25, 0.4)}
-
-
-def towards(polar, azimuth=0.0):
-    """A unit direction, in degrees from the normal."""
-    a, b = math.radians(polar), math.radians(azimuth)
-    return np.array([math.sin(a) * math.cos(b), math.sin(a) * math.sin(b), math.cos(a)])
 
 
 def sphere(down=400, around=400):
@@ -28,10 +22,6 @@ def sphere(down=400, around=400):
     z, phi = (a.ravel() for a in np.meshgrid(cosine, azimuth, indexing="ij"))
     sine = np.sqrt(1 - z * z)
     return (sine * np.cos(phi), sine * np.sin(phi), z), np.repeat(weight, around) * 2 * np.pi / around
-
-
-def triple(v):
-    return tuple(jnp.asarray(c) for c in v)
 
 
 @pytest.mark.parametrize("name", LOBES)
@@ -62,21 +52,10 @@ def test_samples_have_their_density(index, polar):
     w_i, right = jax.vmap(lambda *u: bsdf.sample(triple(w_o), u))(*u)
     x, y, z = (np.asarray(c, float) for c in w_i)
     np.testing.assert_allclose(x * x + y * y + z * z, 1.0, atol=1e-5)
-    right = np.asarray(right)
-    counts, _, _ = np.histogram2d(z[right], np.arctan2(y, x)[right], bins=(12, 24), range=((-1, 1), (-np.pi, np.pi)))
     nodes, weight = sphere(240, 480)
-    density = np.asarray(bsdf.pdf(triple(w_o), triple(nodes)), float) * weight
-    expected, _, _ = np.histogram2d(
-        nodes[2], np.arctan2(nodes[1], nodes[0]), bins=(12, 24), range=((-1, 1), (-np.pi, np.pi)), weights=density
-    )
-    assert abs(expected.sum() - right.mean()) < 0.005
-    observed, wanted = np.append(counts.ravel(), (~right).sum()), n * np.append(expected.ravel(), 1 - expected.sum())
-    enough = wanted > 10
-    observed, wanted = (np.append(a[enough], a[~enough].sum()) for a in (observed, wanted))
-    wanted = np.maximum(wanted, 1e-9) * observed.sum() / wanted.sum()
-    statistic = np.sum(np.square(observed - wanted) / wanted)
-    assert scipy.stats.chi2.sf(statistic, len(wanted) - 1) > 1e-3
-    assert enough.sum() > 30
+    expected = histogram(nodes, weights=np.asarray(bsdf.pdf(triple(w_o), triple(nodes)), float) * weight)
+    assert abs(expected.sum() - np.mean(right)) < 0.005
+    assert chance(w_i, np.asarray(right), expected) > 1e-3
 
 
 @pytest.mark.parametrize("index", [1.5, 1.0, 0.75])

@@ -81,6 +81,7 @@ def test_luminous_balls_and_discs_become_points_at_places_of_their_seed():
 
 BY_VALUE = jvr.ByValue([0.1, 0.9], [0.2, 0.4])
 TABLE = "{positions=[0.1,0.9],values=[0.2,0.4]}"
+BY_GRADIENT = jvr.ByGradient([0.1, 0.9], [0.2, 0.4])
 
 
 @pytest.mark.parametrize(
@@ -100,6 +101,11 @@ TABLE = "{positions=[0.1,0.9],values=[0.2,0.4]}"
             "shading",
             f"{{kind='phenomenological',k_d={TABLE},index=1.3,normalised=false}}",
             jvr.PhenomenologicalBSDF(BY_VALUE, index=1.3, normalised=False),
+        ),
+        (
+            "shading",
+            f"{{kind='anisotropic',direction=[1,0,2],roughness_along={TABLE[:-1]},kind='gradient'}}}}",
+            jvr.AnisotropicGGX([1, 0, 2], roughness_along=BY_GRADIENT),
         ),
         ("shadows", "'rays'", jvr.ShadowRays()),
         ("shadows", "{kind='rays',step=2,termination=0}", jvr.ShadowRays(2, termination=0)),
@@ -161,6 +167,8 @@ def test_a_phase_function_is_a_name_or_a_table(text, wanted):
         ("{albedo=0.5,threshold=0.1}", {"albedo": 0.5, "threshold": 0.1}),
         ("{albedo=[0.1,0.2,0.3]}", {"albedo": [0.1, 0.2, 0.3]}),
         (f"{{albedo={TABLE}}}", {"albedo": BY_VALUE}),
+        (f"{{albedo={TABLE[:-1]},kind='value'}}}}", {"albedo": BY_VALUE}),
+        (f"{{albedo={TABLE[:-1]},kind='gradient'}}}}", {"albedo": BY_GRADIENT}),
     ],
 )
 def test_an_albedo_is_a_number_a_colour_or_by_value(text, keywords):
@@ -270,6 +278,12 @@ def test_a_transfer_function_of_the_gradient_survives_a_file_bit_by_bit(transfer
         ("scattering={albedo=1.5}", "scattering.albedo", "in [0, 1]"),
         ("scattering={albedo='high'}", "scattering.albedo", "a table with positions and values"),
         ("scattering={albedo={positions=[0,1],values=[1,2]}}", "scattering.albedo.values", "entry 1 must be in [0, 1]"),
+        (
+            "scattering={albedo={kind='gradient',positions=[0,1],values=[1,2]}}",
+            "scattering.albedo.values",
+            "entry 1 must be in [0, 1]",
+        ),
+        ("scattering={albedo={kind='gradint',positions=[0],values=[1]}}", "scattering.albedo.kind", "did you mean 'gradient'?"),
         ("scattering={threshold=0}", "scattering.threshold", "positive"),
         ("scattering={phase='rayliegh'}", "scattering.phase", "did you mean 'rayleigh'?"),
         ("scattering={phase='schlick'}", "scattering.phase.k", "missing"),

@@ -68,6 +68,12 @@ def shells() -> jvr.Scene:
     return lit(shading=jvr.PhenomenologicalBSDF(0.4, by_value(0.1, 0.2), 0.3, 12.0, 7.0, 1.3, normalised=False, threshold=0.2))
 
 
+def fibres() -> jvr.Scene:
+    return lit(
+        shading=jvr.AnisotropicGGX((0.3, 0.4, -1), 0.1, 0.5, jvr.ByGradient([0.1, 0.9], [0.2, 0.7]), 0.3, by_value(0.5, 1))
+    )
+
+
 def phases() -> jvr.Scene:
     every = [jvr.Isotropic(), jvr.Rayleigh(), jvr.HenyeyGreenstein((0.1, 0.2, -0.3)), jvr.Schlick(0.4), jvr.JendersieEon(12.0)]
     every += [
@@ -161,6 +167,7 @@ SCENES = {
     "traced": lambda: jax.jit(lambda values: scene(jvr.Volume(values, OBLIQUE)))(with_gaps()),
     "lights": lights,
     "shells": shells,
+    "fibres": fibres,
     "phases": phases,
     "gradient opacity": lambda: lit(
         transfer=jvr.GradientOpacity(linear_transfer(coloured=True), 0.1, 0.7),
@@ -262,7 +269,7 @@ def public_parts() -> set[str]:
         fields = [f for cls in inside for f in (dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ())]
         new = {found for f in fields for found in classes_of(f.type)} - takes
     # A coefficient by value and a dipole stand where a field takes anything.
-    return {name for name, found in classes.items() if issubclass(found, tuple(takes))} | {"ByValue", "Dipole"}
+    return {name for name, found in classes.items() if issubclass(found, tuple(takes))} | {"ByGradient", "ByValue", "Dipole"}
 
 
 def parts_of(tree) -> set[str]:

@@ -187,8 +187,10 @@ POSE = np.eye(4)
 EXAMPLES: dict[str, dict[str, Any]] = {
     "AmbientLight": {},
     "AnalyticGradient": {},
+    "AnisotropicGGX": {"direction": [1.0, 0.0, 0.0]},
     "BlinnPhong": {},
     "BlinnPhongBRDF": {},
+    "ByGradient": {"positions": [0.0, 1.0], "values": [0.2, 0.4]},
     "ByValue": {"positions": [0.0, 1.0], "values": [0.2, 0.4]},
     "CentralDifferences": {},
     "ClippingBox": {"lower": [0.0, 0.0, 0.0], "upper": [1.0, 1.0, 1.0]},
@@ -445,7 +447,12 @@ def test_fits_keep_to_what_is_declared(name):
 def test_the_reference_says_what_is_declared():
     found = public_parameters()
     g, *_ = found["HenyeyGreenstein"]
-    assert (g.name, g.shape, g.range, g.default) == ("g", "() or (3,) or jvr.ByValue", "between -1 and 1, without either", "")
+    assert (g.name, g.shape, g.range, g.default) == (
+        "g",
+        "() or (3,) or jvr.ByValue or jvr.ByGradient",
+        "between -1 and 1, without either",
+        "",
+    )
     diameter = found["JendersieEon"][0]
     assert (diameter.range, diameter.unit) == ("in [5, 50]", "micrometres")
     assert {e.name: e.default for e in found["ShadowRays"]} == {"step": "1", "termination": "0.001"}

@@ -7,6 +7,7 @@ from jvr.io.config.load import Config
 from jvr.io.config.parts import made
 from jvr.model.light import AbstractLight
 from jvr.model.normals import PrecomputedGradient
+from jvr.model.parts import asks_gradient
 from jvr.model.transfer import AbstractTransfer
 from jvr.model.volume import Volume
 
@@ -48,7 +49,7 @@ def _lights(config: Config, tables: list[Any], key: str) -> tuple[AbstractLight,
 def graded(volume: Volume, parts: dict[str, Any], transfer: AbstractTransfer) -> Volume:
     """The volume with gradients at its voxels, where precomputed ones are asked for."""
     normals, others = parts.get("normals"), [parts[name] for name in ("scattering", "material", "specular") if name in parts]
-    asked = "shading" in parts or transfer.takes_gradient or any(part.needs_gradient for part in others)
+    asked = "shading" in parts or transfer.takes_gradient or any(asks_gradient(part) for part in others)
     if not asked or not isinstance(normals, PrecomputedGradient) or normals.of_opacity:
         return volume
     return volume.graded_by_sobel() if normals.sobel else volume.graded()

@@ -15,12 +15,12 @@ from jvr.io.interop.curves import Curve
 from jvr.io.interop.opacity import MOST_OPAQUE, extinction_from_opacity
 from jvr.io.interop.points import COLLINEAR, Samples, light_of, needed, refined, shown, single, width
 from jvr.io.kinds import kind_of, maker_of
-from jvr.model.by_value import ByValue
 from jvr.model.effects import AbstractShading
 from jvr.model.gradient_transfer import GradientOpacity
 from jvr.model.interpolation import AbstractInterpolation, Nearest, Trilinear
 from jvr.model.light import AbstractLight, AmbientLight, HeadLight
 from jvr.model.normals import AbstractNormals, CentralDifferences
+from jvr.model.parameters import AbstractByScalar
 from jvr.model.transfer import AbstractTable, AbstractTransfer, GaussianTransfer, LinearTransfer
 
 DEEPEST = float(extinction_from_opacity(MOST_OPAQUE))
@@ -245,8 +245,8 @@ def _coefficients(shading: Any, lost: dict[str, str]) -> dict[str, Any]:
     found: dict[str, Any] = {"shade": True, "specular": 0.0}
     for ours, theirs in names.items():
         value = getattr(shading, ours, None)
-        if isinstance(value, ByValue):
-            lost[f"{ours} by value"] = "taken at its mean"
+        if isinstance(value, AbstractByScalar):
+            lost[f"{ours} by {'gradient' if value.needs_gradient else 'value'}"] = "taken at its mean"
             value = np.mean(np.asarray(value.values))
         found |= {} if value is None else {theirs: float(value)}
     if kind == "blinn-phong":

@@ -19,8 +19,7 @@ from jvr.io.config.checks import number, number_or_each, number_or_triple, numbe
 from jvr.io.config.errors import first_complaint, shown, unknown_choice
 from jvr.io.config.schema.table import Colour, Table, named
 from jvr.io.kinds import KINDS, maker_of
-from jvr.model.by_value import ByValue
-from jvr.model.parameters import Shape, alternatives, declared, parts_of, shapes_of
+from jvr.model.parameters import AbstractByScalar, Shape, alternatives, declared, parts_of, shapes_of
 from jvr.model.ranges import COLOUR, NOT_NEGATIVE, Interval
 
 
@@ -170,9 +169,18 @@ def _type_of(field: Any) -> Any:
         return _numbers(shapes_of(field), about.about, within)
     constant = _numbers(shapes_of(field), f"{about.about}, or a table with positions and values", within)
     values: Any = (Annotated[list[float], numbers(None, "one for each position", about.within)], ...)
-    by_value = create_model("ByValueTable", __base__=table_of(ByValue), values=values)
-    tag = Discriminator(lambda value: "(by value)" if isinstance(value, dict) else "(constant)")
-    return Annotated[Annotated[constant, Tag("(constant)")] | Annotated[by_value, Tag("(by value)")], tag]
+    varying = PlainValidator(functools.partial(_by_scalar, values))
+    tag = Discriminator(lambda value: "(varying)" if isinstance(value, dict) else "(constant)")
+    return Annotated[Annotated[constant, Tag("(constant)")] | Annotated[Any, varying, Tag("(varying)")], tag]
+
+
+def _by_scalar(values: Any, given: dict[str, Any]) -> KindTable:
+    """The table of a coefficient by scalar, whose `values` are in the range of the number in whose place it stands; without a `kind` it is
+    one by value."""
+    kind = given.get("kind", "value")
+    if kind not in kinds_of(AbstractByScalar):
+        raise problem(unknown_choice(kind, kinds_of(AbstractByScalar)), "kind")
+    return checked_table(create_model("VaryingTable", __base__=table_for(AbstractByScalar, kind), values=values), given)
 
 
 def _numbers(shapes: tuple[Shape, ...], what: str, within: Any) -> Any:
