@@ -46,6 +46,8 @@ def ways(quick: bool) -> list[tuple[str, jvr.Settings]]:
     found = [(PLAIN, jvr.Settings(step)) for step in steps]
     found += [(f"{PLAIN}, pre-integrated", jvr.Settings(step, quadrature=jvr.PreIntegrated())) for step in steps[-3:]]
     found.append(("slices, min.", slices(jvr.Finest(), 0.5)))
+    for pixels in (2,) if quick else (2, 4):
+        found.append((f"slices, PixelSize {pixels}", slices(jvr.PixelSize(jvr.Finest(), pixels=pixels), 0.5)))
     for tolerance in tolerances:
         for oracle in (jvr.OpacityChange(tolerance), jvr.BrickRange(tolerance), jvr.LocalError(tolerance)):
             found.append((f"slices, {type(oracle).__name__} {tolerance:g}", slices(oracle, 0.5)))

@@ -61,8 +61,10 @@ if TYPE_CHECKING:
     from jvr.integrators.refinement import Refinement as Refinement
     from jvr.integrators.slices.oracle import BrickRange as BrickRange
     from jvr.integrators.slices.oracle import Finest as Finest
+    from jvr.integrators.slices.oracle import GivenDistances as GivenDistances
     from jvr.integrators.slices.oracle import LocalError as LocalError
     from jvr.integrators.slices.oracle import OpacityChange as OpacityChange
+    from jvr.integrators.slices.oracle import PixelSize as PixelSize
     from jvr.integrators.slices.picture import Slices as Slices
     from jvr.io.exported import use_export as use_export
     from jvr.io.images import read_image as read_image

@@ -12,6 +12,7 @@ import pytest
 from scenes import render
 
 import jvr
+from jvr.integrators.image_plane import image_plane
 from jvr.io.config import build_scene, build_settings, read_config
 from jvr.model.phase import ScatteringAngle
 
@@ -240,3 +241,14 @@ def test_a_fit_goes_along_the_integrators_rays(added):
     # No ray has a largest scalar below the second point of the table but those that pass beside the ball.
     np.testing.assert_allclose(result.scene.transfer.rgb[1:], BRIGHTNESS.rgb[1:], atol=1e-3)
     assert result.stats.kept_bytes == 0
+
+
+# --- The oracle ------------------------------------------------------------------------------------------------------
+
+
+def test_the_oracle_wants_more_the_nearer_bricks_are_to_its_distance(added):
+    """Of bricks in a row in front of the eye, whose middles are 2, 6, 10 and 14 voxels away from the first."""
+    box = jvr.Volume(np.zeros((5, 5, 17)))
+    look = jvr.OrthographicCamera.look_at([2.0, 2.0, -20.0], [2.0, 2.0, 0.0], [0.0, 1.0, 0.0], 4.0, 4, 4)
+    found = added.Focus(30.0).wanted(box, None, image_plane(look, jnp.zeros(())))
+    np.testing.assert_allclose(found[0, 0], [0.8, 0.4, 0.0, 0.4], atol=1e-6)

@@ -133,6 +133,8 @@ KINDS: dict[type, dict[str, str]] = {
         "opacity-change": "OpacityChange",
         "brick-range": "BrickRange",
         "finest": "Finest",
+        "pixel-size": "PixelSize",
+        "given": "GivenDistances",
     },
 }
 

@@ -35,10 +35,15 @@ def bricks_of(values: Voxels, size: int = 4) -> Bricks:
     return Bricks(lower, upper, size)
 
 
+def bricks_along(n: int, size: int) -> int:
+    """How many bricks an axis of `n` voxels has."""
+    return max(1, -(-(n - 1) // size))
+
+
 def _along(values: Array, axis: int, size: int, extreme: Any) -> Array:
     """Extremes of each run of `size + 1` voxels along an axis, runs sharing their ends; the last one may be shorter."""
     n = values.shape[axis]
-    count = max(1, -(-(n - 1) // size))
+    count = bricks_along(n, size)
     last = jax.lax.slice_in_dim(values, n - 1, n, axis=axis)
 
     def voxel(i: int) -> Array:

@@ -10,6 +10,7 @@ import pytest
 from scenes import OBLIQUE, affine, gaussian_transfer, linear_transfer, lut_transfer, orthographic, perspective, voxels
 
 import jvr
+from jvr.integrators.image_plane import image_plane
 from jvr.integrators.slices.march import SliceOptions, slice_level, synthesise
 from jvr.integrators.slices.oracle import distance_field, envelope
 from jvr.integrators.slices.picture import picture_of
@@ -189,11 +190,14 @@ def test_an_envelope_is_what_is_wanted_plus_the_way_to_it():
 
 STEP = np.where(np.arange(24)[:, None, None] < 12, 0.1, 0.9) * np.ones((24, 3, 3))
 ORACLES = (jvr.OpacityChange, jvr.BrickRange, jvr.LocalError)
+# Of any view: these oracles do not look at it.
+CAMERA = perspective(jvr.Volume(voxels()))
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def ask(oracle, volume, transfer, optical, farthest):
-    return distance_field(oracle, volume, transfer, optical, farthest)
+    plane = image_plane(CAMERA, jnp.zeros_like(farthest))
+    return distance_field(oracle, volume, transfer, optical, plane, farthest)
 
 
 def field(oracle, values, transfer, farthest=100.0, optical=jvr.EmissionAbsorption()):

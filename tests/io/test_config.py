@@ -88,6 +88,12 @@ def refusal(text, *sets):
         ("[settings.sampling]\nkind = 'slices'\nlevels = 6", "settings.sampling.levels", "from 0 to 5"),
         ("[settings.sampling]\nkind = 'slices'\ntolerance = 0", "settings.sampling.tolerance", "must be positive"),
         ("[settings.sampling]\nkind = 'slices'\noracle = 'finst'", "settings.sampling.oracle", "did you mean 'finest'?"),
+        ("[settings.sampling]\nkind = 'slices'\noracle = 'pixel-size'\ntolerance = 1", "settings.sampling", "has no tolerance"),
+        (
+            "[settings.sampling]\nkind = 'slices'\n[settings.sampling.oracle]\nkind = 'given'\ndistances = [[[-1]]]",
+            "settings.sampling.oracle",
+            "distances must be not negative",
+        ),
         ("[settings.sampling]\nkind = 'refinement'\ntile = 6", "settings.sampling", "a power of two from 2 to 64"),
         ("[clipping]\nkind = 'ball'\nlower = [0, 0, 0]\nupper = [1, 1, 1]", "clipping.kind", "known: box, plane"),
         (
@@ -275,6 +281,14 @@ def test_settings_become_objects():
         ("{kind='slices', oracle={kind='brick-range', tolerance=0.02}}", jvr.Slices(jvr.BrickRange(0.02))),
         ("{kind='slices', oracle='finest'}", jvr.Slices(jvr.Finest())),
         ("{kind='slices', oracle='finest', tolerance=0.02}", jvr.Slices(jvr.Finest())),
+        (
+            "{kind='slices', oracle={kind='pixel-size', pixels=3, oracle={kind='opacity-change', tolerance=0.02}}}",
+            jvr.Slices(jvr.PixelSize(jvr.OpacityChange(0.02), pixels=3)),
+        ),
+        (
+            "{kind='slices', oracle={kind='given', distances=[[[0, 1.5], [inf, 2]]], brick=8}}",
+            jvr.Slices(jvr.GivenDistances([[[0, 1.5], [np.inf, 2]]], brick=8)),
+        ),
     ],
 )
 def test_a_sampling_is_a_name_or_a_table(text, wanted):

@@ -183,7 +183,7 @@ def take_slice(
     """The pyramid as slice `k` leaves it (figure 3), the pixels of the finest level that it visits, and the number of samples that it
     takes on each level; `taps` are added to them."""
     lattice, top, whole = slices.lattice, slice_level(options, k), k % options.period == 0
-    unit = jnp.maximum(slices.dt, lattice.unit + k * lattice.unit_slope)
+    pixel = lattice.unit + k * lattice.unit_slope
     active = in_use(options, lattice, k - k % options.period, ended)
     # In front of the entry all samples are clamped to it; the first visit has taken that one.
     behind = jnp.where(whole, start_of(options, lattice) <= k, lattice.first < k)
@@ -202,7 +202,7 @@ def take_slice(
             )
             s, d = fine(s, coarser.s), fine(d, coarser.d)
             sampled = visited & (d < 2 ** (level + 1))
-        found = _sample(slices, lattice.rays[level], k, unit, sampled)
+        found = _sample(slices, lattice.rays[level], k, pixel, sampled)
         s, d = jnp.where(sampled, found.s + taps[level], s), jnp.where(sampled, found.d, d)
         return Level(s, d), visited, jnp.sum(sampled, dtype=jnp.int32)
 
@@ -216,13 +216,14 @@ def take_slice(
     return tuple(levels), visited, jnp.stack(counts)
 
 
-def _sample(slices: Sliced, rays: Float[Array, "n 8"], k: Int[Array, ""], unit: Scalar, mask: Bool[Array, "n"]) -> Level:
+def _sample(slices: Sliced, rays: Float[Array, "n 8"], k: Int[Array, ""], pixel: Scalar, mask: Bool[Array, "n"]) -> Level:
     """Scalar and wanted distance of the pixels of a level that are sampled."""
-    volume, rays, dt, distances, unit = jax.lax.stop_gradient((slices.volume, rays, slices.dt, slices.distances, unit))
+    volume, rays, dt, distances, pixel = jax.lax.stop_gradient((slices.volume, rays, slices.dt, slices.distances, pixel))
+    unit = jnp.maximum(dt, pixel)
 
     def body(index: Array, valid: Array, rows: Array, values: Level) -> Level:
         p = position(rows, k, dt, volume.shape)
-        s, d = jax.vmap(volume.sample)(p), distances.at(p) / unit
+        s, d = jax.vmap(volume.sample)(p), distances.at(p, pixel) / unit
         return Level(write(values.s, index, valid, s), write(values.d, index, valid, d))
 
     blank = jnp.zeros(mask.size, dt.dtype)

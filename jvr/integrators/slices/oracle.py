@@ -1,44 +1,52 @@
 """How far apart samples may be: oracles for adaptive sampling (Kraus, Strengert, Klein and Ertl, "Adaptive sampling in three dimensions
 for volume rendering on GPUs", section 3: an oracle "returns a preferable sampling distance d for any point in space").
 
-The oracles here look at the volume and the transfer function, not at the view. Each says for every brick of voxels what distance
-that brick asks for by itself; a point is then given the smallest of what any brick asks for plus the way to it. What bricks ask for
-is measured by what one voxel length of the medium, if it were all alike, would add to a picture: its opacity and the radiance that it
-emits, both 0 ... 1 for colours of 0 ... 1. No derivative goes through any of this.
+An oracle says for every brick of voxels what distance that brick asks for by itself; a point is then given the smallest of what any
+brick asks for plus the way to it. It may look at the volume, the transfer function and the view, or know the answer beforehand. What
+bricks ask for is measured by what one voxel length of the medium, if it were all alike, would add to a picture: its opacity and the
+radiance that it emits, both 0 ... 1 for colours of 0 ... 1. No derivative goes through any of this.
 """
 
 import abc
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from equinox.internal import unvmap_any
 from jaxtyping import Array, Float, Int
 
-from jvr.model.bricks import bricks_of
+from jvr.integrators.image_plane import ImagePlane
+from jvr.model.bricks import bricks_along, bricks_of
+from jvr.model.checks import known
 from jvr.model.optical import AbstractOpticalModel
-from jvr.model.parameters import assign, choice
-from jvr.model.ranges import POSITIVE
+from jvr.model.parameters import array_of, assign, choice, declared, parameter
+from jvr.model.ranges import AT_LEAST_ONE, INCREASING, POSITIVE, Interval
 from jvr.model.transfer import LinearTransfer, LutTransfer
 from jvr.model.volume import Volume
 from jvr.numerics import one_minus_exp, read_at
-from jvr.types import Scalar, Triple
+from jvr.types import ArrayLike, Scalar, Triple
+
+DISTANCE = Interval(low=0.0, takes_infinity=True)
 
 
 class DistanceField(eqx.Module):
-    """The distance that is wanted between samples, a world length for each brick of `size` voxels an edge."""
+    """The distance that is wanted between samples, a world length for each brick of `brick` voxels an edge, and never less than
+    `pixels` are wide."""
 
     distance: Float[Array, "bx by bz"]
     brick: int = eqx.field(static=True)
+    pixels: float = eqx.field(static=True, default=0.0)
 
-    def at(self, p: Triple) -> Float[Array, "points"]:
-        """The wanted distance at grid positions."""
+    def at(self, p: Triple, pixel: Scalar) -> Float[Array, "points"]:
+        """The wanted distance at grid positions, all as far from the eye as a pixel is `pixel` wide."""
         index = [
             jnp.clip(jnp.floor(x / self.brick), 0, n - 1).astype(jnp.int32) for x, n in zip(p, self.distance.shape, strict=True)
         ]
         flat = (index[0] * self.distance.shape[1] + index[1]) * self.distance.shape[2] + index[2]
-        return read_at(self.distance.reshape(-1), flat)
+        wanted = read_at(self.distance.reshape(-1), flat)
+        return jnp.maximum(wanted, self.pixels * pixel) if self.pixels else wanted
 
 
 class AbstractOracle(eqx.Module):
@@ -47,8 +55,17 @@ class AbstractOracle(eqx.Module):
     brick: ClassVar[int]
 
     @abc.abstractmethod
-    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
-        """The distance between samples that each brick asks for by itself, a world length, infinite where any will do."""
+    def wanted(self, volume: Volume, features: "Features", plane: ImagePlane) -> Float[Array, "bx by bz"]:
+        """The distance between samples that each brick asks for by itself, a world length, infinite where any will do; traceable.
+
+        `features`: what the medium may add to a picture, by scalar; `plane`: the view, in whose world the volume is. Brick `b` of an
+        axis holds voxels `b * brick ... (b + 1) * brick` (`jvr.model.bricks`).
+        """
+
+    @property
+    def least(self) -> float:
+        """How many pixels any distance is wide at least, whatever bricks ask for."""
+        return 0.0
 
 
 class Finest(AbstractOracle):
@@ -56,7 +73,7 @@ class Finest(AbstractOracle):
 
     brick: ClassVar[int] = 64
 
-    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
+    def wanted(self, volume: Volume, features: "Features", plane: ImagePlane) -> Float[Array, "bx by bz"]:
         return jnp.zeros_like(bricks_of(volume.values, self.brick).lower, jnp.result_type(volume.slope))
 
 
@@ -75,7 +92,7 @@ class OpacityChange(_Tolerant):
 
     brick: ClassVar[int] = 1
 
-    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
+    def wanted(self, volume: Volume, features: "Features", plane: ImagePlane) -> Float[Array, "bx by bz"]:
         change = _spread(features._replace(rows=features.rows[-1:]), *_bounds(volume, self.brick))
         return jnp.where(change <= self.tolerance, jnp.inf, 0.0)
 
@@ -86,7 +103,7 @@ class BrickRange(_Tolerant):
 
     brick: ClassVar[int] = 4
 
-    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
+    def wanted(self, volume: Volume, features: "Features", plane: ImagePlane) -> Float[Array, "bx by bz"]:
         change = _spread(features, *_bounds(volume, self.brick))
         return jnp.min(volume.spacing) * self.brick * _quotient(self.tolerance, change)
 
@@ -106,7 +123,7 @@ class LocalError(_Tolerant):
 
     brick: ClassVar[int] = 1
 
-    def wanted(self, volume: Volume, features: "Features") -> Float[Array, "bx by bz"]:
+    def wanted(self, volume: Volume, features: "Features", plane: ImagePlane) -> Float[Array, "bx by bz"]:
         c1, c2, largest = (bricks_of(c, self.brick).upper for c in _curvatures(volume))
         low, high = _bounds(volume, self.brick)
         # Interpolated values leave the range of the voxels by no more than a second difference.
@@ -116,13 +133,97 @@ class LocalError(_Tolerant):
         return jnp.where(jnp.isnan(low + high), 0.0, distance)
 
 
+class PixelSize(AbstractOracle):
+    """What another oracle wants, but nowhere less than `pixels` pixels are wide there: what is smaller on the picture is not looked for.
+
+    With `d` what the other oracle wants at a point, and `w` the width of a pixel at the point's distance `r` from the eye, in the middle of
+    the picture, which is `2 r tan(fov_y / 2) / height` for a perspective camera, this wants
+
+        max(d, pixels * w(r)).
+
+    Where pixels are wider than slices are apart, as far from the eye, one in `2^l` is then sampled at most in each direction, `2^l`
+    the largest power of two up to `pixels`; where they are narrower, as near the eye, more are. **Arguments:** `oracle`: the other one,
+    `jvr.LocalError()` by default. **Raises** `ValueError` for pixels out of range.
+    """
+
+    oracle: AbstractOracle = parameter(doc="the oracle that is asked first")
+    pixels: float = choice(POSITIVE, doc="pixels in a row of which one is enough", hint="2 is a good start")
+    brick: int = eqx.field(static=True, default=1)  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __init__(self, oracle: AbstractOracle = LocalError(), *, pixels: float | int = 2.0):
+        assign(self, oracle=oracle, pixels=pixels)
+        self.brick = oracle.brick  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def wanted(self, volume: Volume, features: "Features", plane: ImagePlane) -> Float[Array, "bx by bz"]:
+        return self.oracle.wanted(volume, features, plane)
+
+    @property
+    def least(self) -> float:
+        return max(self.pixels, self.oracle.least)
+
+
+class GivenDistances(AbstractOracle):
+    """Distances that are known beforehand, as by an oracle that is "pre-computed and stored with the data set" (section 4).
+
+    **Arguments:** `distances`: the world length that each brick asks for, `(bricks along x, y, z)`, 0 for every sample, infinite where
+    any will do; `brick`: voxels along an edge of a brick, of which an axis of `n` voxels has `ceil((n - 1) / brick)`, at least one. Both
+    are static: a picture is compiled for them. What a program computes anew, such as for each view, is a class of its own.
+    **Raises** `ValueError` for distances that are negative or NaN, and, when a picture is made, for a volume of other bricks.
+    """
+
+    distances: Any = choice(DISTANCE, doc="that bricks ask for, along x, y, z", unit="mm")
+    brick: int = choice(AT_LEAST_ONE, doc="voxels along an edge of a brick")  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __init__(self, distances: ArrayLike, *, brick: int = 4):
+        assign(self, brick=brick)
+        about = declared(GivenDistances)["distances"].metadata["parameter"]
+        array = known(array_of(distances, "distances", about, (("x", "y", "z"),)))
+        if array is None:
+            raise ValueError(
+                "distances must be known when a picture is compiled: derive an oracle that computes them from its class"
+            )
+        self.distances = tuple(tuple(tuple(row) for row in plane) for plane in array.tolist())
+
+    @classmethod
+    def from_errors(cls, errors: ArrayLike, lengths: ArrayLike, tolerance: float, *, brick: int = 4) -> "GivenDistances":
+        """Of errors `(levels, bricks along x, y, z)` that samples make which are `lengths` `(levels,)` apart, increasing world lengths:
+        each brick asks for the longest whose error, and that of all shorter ones, is at most `tolerance`, and for every sample where
+        there is none. **Raises** `ValueError` for shapes that do not fit and lengths that do not increase."""
+        errors, lengths = np.asarray(errors), np.asarray(lengths)
+        if errors.ndim != 4 or lengths.shape != errors.shape[:1]:
+            raise ValueError(
+                f"errors must be (levels, x, y, z) and lengths (levels,), not {errors.shape} and {lengths.shape}: give an array of "
+                "errors in bricks for each length"
+            )
+        if not INCREASING.holds(lengths) or lengths[0] <= 0:
+            raise ValueError("lengths must be positive and strictly increasing: sort levels from the finest on")
+        good = np.cumprod(errors <= tolerance, axis=0).sum(axis=0)
+        return cls(np.array([0.0, *lengths])[good], brick=brick)
+
+    def wanted(self, volume: Volume, features: "Features", plane: ImagePlane) -> Float[Array, "bx by bz"]:
+        return jnp.asarray(np.array(self.distances), volume.slope.dtype)
+
+
 def distance_field(
-    oracle: AbstractOracle, volume: Volume, table: LinearTransfer | LutTransfer, optical: AbstractOpticalModel, farthest: Scalar
+    oracle: AbstractOracle,
+    volume: Volume,
+    table: LinearTransfer | LutTransfer,
+    optical: AbstractOpticalModel,
+    plane: ImagePlane,
+    farthest: Scalar,
 ) -> DistanceField:
-    """What `oracle` says, up to the world length `farthest`; traceable, not differentiable."""
-    volume, table, optical, farthest = jax.lax.stop_gradient((volume, table, optical, farthest))
-    wanted = oracle.wanted(volume, features_of(volume, table, optical))
-    return DistanceField(envelope(wanted, thickness(volume, oracle.brick), farthest), oracle.brick)
+    """What `oracle` says, up to the world length `farthest`; traceable, not differentiable. Where it says NaN, every sample is wanted.
+    **Raises** `ValueError` where it speaks of other bricks than the volume has."""
+    oracle, volume, table, optical, plane, farthest = jax.lax.stop_gradient((oracle, volume, table, optical, plane, farthest))
+    wanted = oracle.wanted(volume, features_of(volume, table, optical), plane)
+    bricks = tuple(bricks_along(n, oracle.brick) for n in volume.shape)
+    if wanted.shape != bricks:
+        raise ValueError(
+            f"{type(oracle).__name__} asks for the distances of {wanted.shape} bricks; of {oracle.brick}^3 voxels, a volume of "
+            f"{volume.shape} has {bricks}: give as many, or another brick="
+        )
+    wanted = jnp.where(jnp.isnan(wanted), 0.0, wanted).astype(farthest.dtype)
+    return DistanceField(envelope(wanted, thickness(volume, oracle.brick), farthest), oracle.brick, oracle.least)
 
 
 def thickness(volume: Volume, brick: int) -> Triple:

@@ -51,7 +51,8 @@ class Slices(AbstractIntegrator):
     scalar is interpolated, by B-splines across the view and by pre-integration along it (`jvr.integrators.slices`).
 
     **Arguments:** `oracle`: says how far apart samples may be, within its tolerance: `jvr.LocalError()` (default),
-    `jvr.OpacityChange()`, `jvr.BrickRange()`, or `jvr.Finest()`, which allows nothing. `levels`: samples are at most `2^levels` slices
+    `jvr.OpacityChange()`, `jvr.BrickRange()`, `jvr.Finest()`, which allows nothing, `jvr.PixelSize()`, which looks at the view as well,
+    `jvr.GivenDistances()`, which knows them beforehand, or one of your own. `levels`: samples are at most `2^levels` slices
     and pixels apart, 0 ... 5; 0 leaves none out. **Raises** `ValueError` for levels out of range.
 
     Samples lie on slices `settings.step` voxels apart, the first where the first ray enters: planes for an orthographic camera, spheres
@@ -67,7 +68,7 @@ class Slices(AbstractIntegrator):
     adjoints other than `jvr.Replay()`.
     """
 
-    oracle: AbstractOracle = parameter(doc="jvr.LocalError(), jvr.OpacityChange(), jvr.BrickRange() or jvr.Finest()")
+    oracle: AbstractOracle = parameter(doc="jvr.LocalError() or another oracle")
     levels: int = choice(Interval(0.0, 5.0), doc="samples are up to 2^levels slices and pixels apart")
 
     def __init__(self, oracle: AbstractOracle = LocalError(), *, levels: int = 3):
@@ -91,7 +92,7 @@ def picture_of(view: View, sampling: Slices, *, distances: DistanceField | None 
     lattice, finest, t_in = _lattice(scene, camera, plane, options, dt)
     if distances is None:
         farthest = _farthest(scene, sampling, options, lattice, dt)
-        distances = distance_field(sampling.oracle, scene.volume, table, scene.optical, farthest)
+        distances = distance_field(sampling.oracle, scene.volume, table, scene.optical, plane, farthest)
 
     parts = settings.quadrature.parts if isinstance(settings.quadrature, PreIntegrated) else 1
     shading = (PreIntegratedTable(table, parts), scene.optical)

@@ -23,7 +23,7 @@ from jvr.io.config.schema.light import (
 from jvr.io.config.schema.parts import BASES, WRITTEN, KindTable, only, part
 from jvr.io.config.schema.table import Extinction, Position, Range, Scalar, Table, one_or_more
 from jvr.io.config.schema.transfer import Transfer
-from jvr.io.kinds import maker_of
+from jvr.io.kinds import kind_of, maker_of
 from jvr.model.camera import AbstractCamera
 from jvr.model.clipping import AbstractClipping
 from jvr.model.interpolation import AbstractInterpolation
@@ -136,8 +136,11 @@ class SlicesTable(KindTable):
     @staticmethod
     def part(tolerance: float | None = None, **keywords: Any) -> Any:
         slices = maker_of(AbstractIntegrator, "slices")(**keywords)
-        if tolerance is None or "tolerance" not in declared(type(slices.oracle)):
+        # Of no tolerance nothing finer can be asked than every sample.
+        if tolerance is None or kind_of(slices.oracle) == "finest":
             return slices
+        if "tolerance" not in declared(type(slices.oracle)):
+            raise ValueError(f"{type(slices.oracle).__name__} has no tolerance: say it in the table of an oracle that has")
         return dataclasses.replace(slices, oracle=dataclasses.replace(slices.oracle, tolerance=tolerance))
 
 
