@@ -147,6 +147,10 @@ if TYPE_CHECKING:
     from jvr.rendering.marching import Uniform as Uniform
     from jvr.rendering.measure import Measurement as Measurement
     from jvr.rendering.measure import measure as measure
+    from jvr.rendering.pixel_filters import BoxFilter as BoxFilter
+    from jvr.rendering.pixel_filters import GaussianFilter as GaussianFilter
+    from jvr.rendering.pixel_filters import MitchellFilter as MitchellFilter
+    from jvr.rendering.pixel_filters import TentFilter as TentFilter
     from jvr.rendering.plan import plan as plan
     from jvr.rendering.render import render as render
     from jvr.rendering.settings import Settings as Settings

@@ -116,6 +116,7 @@ NAMES = {
     "jvr.rendering.layers": ("render_layers",),
     "jvr.rendering.marching": ("Uniform",),
     "jvr.rendering.measure": ("Measurement", "measure"),
+    "jvr.rendering.pixel_filters": ("BoxFilter", "GaussianFilter", "MitchellFilter", "TentFilter"),
     "jvr.rendering.plan": ("plan",),
     "jvr.rendering.render": ("render",),
     "jvr.rendering.settings": ("Settings",),

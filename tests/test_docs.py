@@ -39,6 +39,7 @@ from jvr.model.normals import AbstractNormals
 from jvr.model.phase import AbstractPhase
 from jvr.names import NAMES
 from jvr.rendering.integrator import AbstractIntegrator
+from jvr.rendering.pixel_filters import AbstractPixelFilter
 
 PUBLIC = {name for names in NAMES.values() for name in names}
 LANGUAGES = {"python", "sh", "toml", "math", "bibtex"}
@@ -186,6 +187,7 @@ FAMILIES = {
     "[camera]": AbstractCamera,
     "[settings.quadrature]": AbstractQuadrature,
     "[settings.adjoint]": AbstractAdjoint,
+    "[settings.pixel_filter]": AbstractPixelFilter,
     "[settings.sampling]": AbstractIntegrator,
     "[settings.sampling.oracle]": AbstractOracle,
 }

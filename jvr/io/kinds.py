@@ -35,6 +35,7 @@ from jvr.model.phase import AbstractPhase
 from jvr.model.transfer import AbstractTransfer
 from jvr.names import NAMES
 from jvr.rendering.integrator import AbstractIntegrator
+from jvr.rendering.pixel_filters import AbstractPixelFilter
 
 HOMES = {name: module for module, names in NAMES.items() for name in names}
 # Public classes that a scene is made of, by name: the module that is imported when a file names one, or a class that was registered.
@@ -128,6 +129,7 @@ KINDS: dict[type, dict[str, str]] = {
     AbstractQuadrature: {"midpoint": "Midpoint", "pre-integrated": "PreIntegrated"},
     AbstractAdjoint: {"replay": "Replay", "forward": "Forward", "rows": "Rows"},
     AbstractIntegrator: {"uniform": "Uniform", "slices": "Slices", "refinement": "Refinement"},
+    AbstractPixelFilter: {"box": "BoxFilter", "tent": "TentFilter", "gaussian": "GaussianFilter", "mitchell": "MitchellFilter"},
     AbstractOracle: {
         "local-error": "LocalError",
         "opacity-change": "OpacityChange",

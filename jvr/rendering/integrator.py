@@ -135,7 +135,7 @@ def make_picture(scene: Scene, camera: AbstractCamera, settings: "Settings", ste
     n = settings.pixel_samples
     view = View(scene, camera if n == 1 else finer(camera, n), settings, step * jnp.min(scene.volume.spacing))
     picture = settings.sampling.picture(view)
-    return picture if n == 1 else filtered(picture, n)
+    return picture if n == 1 else filtered(picture, n, settings.pixel_filter)
 
 
 compiled_picture = program(make_picture, static_argnums=2)

@@ -9,6 +9,7 @@ from jvr.model.parts import AbstractPart, Knob, PlanEntry
 from jvr.model.ranges import AT_LEAST_ONE, POSITIVE, TRANSMITTANCE
 from jvr.rendering.integrator import AbstractIntegrator
 from jvr.rendering.marching import Uniform
+from jvr.rendering.pixel_filters import AbstractPixelFilter, BoxFilter
 
 # Values of its knobs, the coarsest first.
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
@@ -37,6 +38,8 @@ class Settings(AbstractPart):
     - `sampling`: which samples are taken: `jvr.Uniform()` (default: all), `jvr.Refinement()` or `jvr.Slices()`.
     - `pixel_samples`: `n`, for `n x n` rays a pixel, on a regular grid, of which the pixel is the mean: edges without steps, at `n^2` times
       the time. Fits and geometry by pixels (`jvr.DepthImage`) want 1, a ray through the middle.
+    - `pixel_filter`: the weights of that mean: `jvr.BoxFilter()` (default, the pixel's own rays alike), or, with rays of neighbours,
+      `jvr.TentFilter()`, `jvr.GaussianFilter()` or `jvr.MitchellFilter()`. With one ray a pixel there is nothing to weigh.
     - `tile`: rays marched at a time. Memory is about 120 bytes a ray; smaller tiles need less and take longer.
 
     **Raises** `ValueError` for values out of range.
@@ -51,6 +54,9 @@ class Settings(AbstractPart):
     sampling: AbstractIntegrator = parameter(doc="jvr.Uniform(), jvr.Refinement() or jvr.Slices()")
     tile: int = choice(AT_LEAST_ONE, doc="rays at a time")
     pixel_samples: int = choice(AT_LEAST_ONE, doc="rays a pixel along rows and along columns", most=64)
+    pixel_filter: AbstractPixelFilter = parameter(
+        doc="jvr.BoxFilter(), jvr.TentFilter(), jvr.GaussianFilter() or jvr.MitchellFilter()"
+    )
 
     def __init__(
         self,
@@ -64,13 +70,17 @@ class Settings(AbstractPart):
         sampling: AbstractIntegrator = Uniform(),
         tile: int = 262_144,
         pixel_samples: int = 1,
+        pixel_filter: AbstractPixelFilter = BoxFilter(),
     ):
         assign(self, step=step, termination=termination, quadrature=quadrature, skipping=skipping)
         assign(self, negligible=negligible, adjoint=adjoint, sampling=sampling, tile=tile, pixel_samples=pixel_samples)
+        assign(self, pixel_filter=pixel_filter)
         if negligible and not skipping:
             raise ValueError("negligible bricks can only be left out with skipping=True")
         if negligible and not isinstance(quadrature, Midpoint):
             raise ValueError("what is negligible is left out by midpoints: set quadrature=jvr.Midpoint()")
+        if pixel_samples == 1 and pixel_filter != BoxFilter():
+            raise ValueError("a pixel filter weighs several rays a pixel: set pixel_samples=2 or more, or leave pixel_filter out")
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
         absorbs, ends = scene.optical.absorbs, self.termination > 0
