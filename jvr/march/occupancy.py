@@ -1,9 +1,10 @@
 """Empty-space skipping: the bricks that a transfer function leaves empty, and how far rays may skip them.
 
 A brick is empty if no value between its smallest and largest voxel has extinction, or emission of its own, above a bound, by default zero;
-without either nothing is emitted (`j = sigma_t rgb + q` in every optical model). Around each empty brick there is a cube of empty
-bricks, and a ray inside of it goes on with the first sample outside. Samples stay where they are, so a picture with skips and one
-without take the same contributing samples.
+without either nothing is emitted (`j = sigma_t rgb + q` in every optical model). Where a transfer function takes the length of the
+gradient, no length up to the longest of the brick may have any. Around each empty brick there is a cube of empty bricks, and a ray inside
+of it goes on with the first sample outside. Samples stay where they are, so a picture with skips and one without take the same
+contributing samples.
 """
 
 import functools
@@ -80,13 +81,19 @@ class Occupancy(eqx.Module):
 
 
 def occupancy_of(
-    bricks: Bricks, slope: Scalar, intercept: Scalar, transfer: AbstractTransfer, least: Scalar | float | None = None
+    bricks: Bricks,
+    slope: Scalar,
+    intercept: Scalar,
+    transfer: AbstractTransfer,
+    least: Scalar | float | None = None,
+    steepest: Float[Array, "bx by bz"] | None = None,
 ) -> Occupancy:
     """Which bricks of a volume a transfer function makes visible; milliseconds, traceable. Not differentiable.
 
-    With a bound `least` on extinction, what is below it is not visible, and derivatives skip it too.
+    With a bound `least` on extinction, what is below it is not visible, and derivatives skip it too. `steepest`: bounds on the length of
+    the gradient in each brick, per world length (`jvr.march.steepest.steepest_gradients`), where that matters.
     """
-    empty = lambda nearby: ~visible_bricks(bricks, slope, intercept, transfer, least, nearby=nearby)
+    empty = lambda nearby: ~visible_bricks(bricks, slope, intercept, transfer, least, steepest, nearby=nearby)
     if least is not None:
         (empty_radius,) = _empty_radii(empty(True))
         return Occupancy(empty_radius, None, bricks.size)
@@ -108,15 +115,21 @@ def visible_bricks(
     intercept: Scalar,
     transfer: AbstractTransfer,
     least: Scalar | float | None = None,
+    steepest: Float[Array, "bx by bz"] | None = None,
     *,
     nearby: bool = False,
 ) -> Bool[Array, "bx by bz"]:
-    """Bricks that a transfer function gives more extinction than `least`, by default none, somewhere between their bounds; `nearby`: also
-    those where it has a derivative in the scalar. Not differentiable."""
+    """Bricks that a transfer function gives more extinction than `least`, by default none, somewhere between their bounds and with no
+    gradient longer than `steepest`; `nearby`: also those where it has a derivative in the scalar. Not differentiable."""
     slope, intercept, transfer = jax.lax.stop_gradient((slope, intercept, transfer))
     low, high = _scalar_bounds(bricks, slope, intercept)
-    is_visible = jax.vmap(lambda low, high: transfer.is_visible(low, high, 0.0 if least is None else least, nearby=nearby))
-    return is_visible(low.ravel(), high.ravel()).reshape(low.shape) | jnp.isnan(low + high)
+    least = 0.0 if least is None else least
+    if steepest is None:
+        found = jax.vmap(lambda low, high: transfer.is_visible(low, high, least, nearby=nearby))(low.ravel(), high.ravel())
+    else:
+        ask = jax.vmap(lambda low, high, longest: transfer.is_visible_below(low, high, longest, least, nearby=nearby))
+        found = ask(low.ravel(), high.ravel(), steepest.ravel())
+    return found.reshape(low.shape) | jnp.isnan(low + high)
 
 
 def _scalar_bounds(bricks: Bricks, slope: Scalar, intercept: Scalar) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:

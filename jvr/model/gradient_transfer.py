@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jvr.model.checks import require
 from jvr.model.parameters import assign, parameter
 from jvr.model.ranges import COLOUR, EXTINCTION, INCREASING, NOT_NEGATIVE
-from jvr.model.transfer import AbstractTransfer, Classified, any_between, own_emission, shown_entries
+from jvr.model.transfer import AbstractTransfer, Classified, any_between, entries_between, own_emission, shown_entries
 from jvr.numerics import clamp, larger, smaller
 from jvr.types import ArrayLike, Channels, Scalar
 
@@ -56,12 +56,28 @@ class GradientTransfer(AbstractTransfer):
         return Classified((r, g, b), tuple(rest[:columns]), tuple(rest[columns:]))
 
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
-        # Whatever the length of the gradient: it depends on voxels farther away, too.
+        # Whatever the length of the gradient.
         n = self.rgb.shape[0]
         visible = shown_entries([self.sigma_t] if self.emission is None else [self.sigma_t, self.emission], least)
         beyond = high < self.domain[0], low > self.domain[1]
         u, v = (_coordinate(s, self.domain, n) for s in (low, high))
         return any_between(visible, u, v, beyond if nearby else None)
+
+    def is_visible_below(
+        self, low: Scalar, high: Scalar, steepest: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False
+    ) -> Bool[Array, ""]:
+        n, m, _ = self.rgb.shape
+        flat = [x if x is None else x.reshape(n * m, -1) for x in (self.sigma_t, self.emission)]
+        visible = shown_entries([x for x in flat if x is not None], least).reshape(n, m)
+
+        def entries(low: Scalar, high: Scalar, domain: Float[Array, "2"], count: int) -> tuple[Array, Array]:
+            beyond = (high < domain[0], low > domain[1]) if nearby else None
+            return entries_between(_coordinate(low, domain, count), _coordinate(high, domain, count), count, beyond)
+
+        (i, k), (j, m) = entries(low, high, self.domain, n), entries(jnp.zeros_like(low), steepest, self.magnitudes, m)
+        # How many are visible in the rows and columns before each.
+        before = jnp.pad(jnp.cumsum(jnp.cumsum(visible, 0, dtype=jnp.int32), 1, dtype=jnp.int32), ((1, 0), (1, 0)))
+        return before[k + 1, m + 1] - before[i, m + 1] - before[k + 1, j] + before[i, j] > 0
 
 
 class GradientOpacity(AbstractTransfer):
@@ -102,6 +118,13 @@ class GradientOpacity(AbstractTransfer):
 
     def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
         return self.transfer.is_visible(low, high, least, nearby=nearby)
+
+    def is_visible_below(
+        self, low: Scalar, high: Scalar, steepest: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False
+    ) -> Bool[Array, ""]:
+        # At `low` there is nothing, but more of it with any longer gradient.
+        reaches = steepest >= self.low if nearby else steepest > self.low
+        return reaches & self.is_visible(low, high, least, nearby=nearby)
 
 
 def _cell(x: Scalar, domain: Float[Array, "2"], n: int) -> tuple[Array, Scalar]:

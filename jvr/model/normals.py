@@ -31,6 +31,10 @@ class AbstractNormals(AbstractPart):
     """A gradient estimator. With `of_opacity` it is that of the extinction, after the transfer function (mean of its channels),
     else that of the scalar."""
 
+    # Voxels beyond those of a point's cell, or beyond those that its value is made of, within which differences of neighbours bound the
+    # estimate along each axis; `None` where nothing is known of it.
+    reach: ClassVar[int | None] = None
+
     of_opacity: bool = choice(doc="whether of the extinction, not of the scalar", default=False)
 
     prepared = Renamed("with_gradients")
@@ -90,6 +94,8 @@ class AnalyticGradient(AbstractNormals):
     The nearest voxel's value has none: for labels it is that of `PrecomputedGradient(of_opacity=True)`, unless the transfer function asks
     for the gradient of the scalar.
     """
+
+    reach: ClassVar[int | None] = 0
 
     def with_gradients(self, volume: Volume, transfer: AbstractTransfer) -> AbstractNormals:
         if isinstance(volume.interpolation, Nearest) and not transfer.takes_gradient:
@@ -165,6 +171,7 @@ def _span(shape: tuple[int, int, int], p: Triple, axis: int, before: int, after:
 class ForwardDifferences(AbstractDifferences):
     """`s(p + e) - s(p)` along each axis, backwards where the neighbour would be outside: three more scalars, first order."""
 
+    reach: ClassVar[int | None] = 1
     offsets: ClassVar = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
     def neighbour(self, shape: tuple[int, int, int], p: Triple, offset: tuple[int, int, int]) -> Triple:
@@ -179,6 +186,7 @@ class ForwardDifferences(AbstractDifferences):
 class CentralDifferences(AbstractDifferences):
     """`(s(p + e) - s(p - e)) / 2` along each axis: six more scalars, second order."""
 
+    reach: ClassVar[int | None] = 1
     offsets: ClassVar = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
 
     def difference(self, shape: tuple[int, int, int], p: Triple, center: Float[Array, "..."], around: Channels) -> Triple:
@@ -188,6 +196,7 @@ class CentralDifferences(AbstractDifferences):
 class SobelDifferences(AbstractDifferences):
     """Central differences smoothed with weights 1, 2, 1 along both other axes (Zucker and Hummel 1981): 26 more scalars, least noise."""
 
+    reach: ClassVar[int | None] = 1
     offsets: ClassVar = tuple((i, j, k) for i, j, k in itertools.product((-1, 0, 1), repeat=3) if (i, j, k) != (0, 0, 0))
 
     def difference(self, shape: tuple[int, int, int], p: Triple, center: Float[Array, "..."], around: Channels) -> Triple:
@@ -211,6 +220,8 @@ class PrecomputedGradient(AbstractNormals):
     are those of the nearest voxel, the extinction is smoothed before (1, 4, 6, 4, 1 along each axis), and the gradients are interpolated
     nevertheless: normals of a ball of labels, 10 voxels in radius, are then off by 3 degrees on average in place of 21.
     """
+
+    reach: ClassVar[int | None] = 1
 
     sobel: bool = choice(doc="whether of Sobel's differences, not of central ones", default=False)
     gradients: Float[Array, "x y z 3"] | None = None

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jvr.model.parameters import assign, parameter
 from jvr.model.parts import AbstractPart, PlanEntry, is_zero
@@ -80,6 +80,12 @@ class AbstractTransfer(AbstractPart):
         With `nearby`, whether any may however little it is changed: where none is, neither has a derivative in the value nor in where
         entries lie.
         """
+
+    def is_visible_below(
+        self, low: Scalar, high: Scalar, steepest: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False
+    ) -> Bool[Array, ""]:
+        """`is_visible` of those whose gradient is no longer than `steepest`; where a class does not say, of any."""
+        return self.is_visible(low, high, least, nearby=nearby)
 
     def _repr_html_(self) -> str:
         """What notebooks show."""
@@ -249,14 +255,21 @@ def any_between(
     Where `beyond` says whether what was clamped lies in front of the first entry and behind the last one, also those that have one next
     to `u` and `v`: at an entry both of its neighbours, beyond an end none.
     """
-    n = visible.shape[0]
+    first, last = entries_between(u, v, visible.shape[0], beyond)
+    # Entries are counted: a difference of sums of the extinctions themselves would round small ones away.
+    before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(visible, dtype=jnp.int32)])
+    return before[last + 1] > before[first]
+
+
+def entries_between(
+    u: Scalar, v: Scalar, n: int, beyond: tuple[Bool[Array, ""], Bool[Array, ""]] | None
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The first and the last of the `n` entries that `any_between` looks at."""
     first, last = jnp.floor(u), jnp.ceil(v)
     if beyond is not None:
         first = jnp.where(beyond[1], n - 1, jnp.maximum(jnp.ceil(u) - 1, 0))
         last = jnp.where(beyond[0], 0, jnp.minimum(jnp.floor(v) + 1, n - 1))
-    # Entries are counted: a difference of sums of the extinctions themselves would round small ones away.
-    before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(visible, dtype=jnp.int32)])
-    return before[last.astype(jnp.int32) + 1] > before[first.astype(jnp.int32)]
+    return first.astype(jnp.int32), last.astype(jnp.int32)
 
 
 def _columns(table: Float[Array, "..."]) -> tuple[Float[Array, "n"], ...]:

@@ -18,6 +18,7 @@ from jvr.march.medium import DENSEST, AbstractVisibility, Medium, Visibilities
 from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.quadrature import PreIntegrated
 from jvr.march.shaders import GradientFrame, LightPathShader, OpticalShader, PreIntegratedShader
+from jvr.march.steepest import steepest_gradients
 from jvr.model.bricks import Bricks, bricks_of, widened
 from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbsorptionOnly
@@ -134,7 +135,9 @@ def occupancy(scene: Scene, settings: "Settings") -> Occupancy | None:
     volume = scene.volume
     # No ray is longer than the volume's diameter, so that the optical depth of all that is skipped stays below the bound.
     least = jax.lax.stop_gradient(settings.negligible / (2 * volume.radius)) if settings.negligible else None
-    return occupancy_of(bricks(volume), volume.slope, volume.intercept, scene.transfer, least)
+    found = bricks(volume)
+    steepest = steepest_gradients(volume, scene.normals, found.size) if scene.transfer.takes_gradient else None
+    return occupancy_of(found, volume.slope, volume.intercept, scene.transfer, least, steepest)
 
 
 def bricks(volume: Volume) -> Bricks:
