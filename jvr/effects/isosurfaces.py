@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jvr.effects.lighting import LitShader
+from jvr.effects.lighting import LitShader, reflected, surface_shader
 from jvr.effects.surface_shadows import SurfaceShadows
 from jvr.march.first_hit import FINER, Hits, Reached, Search, leaving, next_hit, start
 from jvr.march.medium import AbstractVisibility, Medium
@@ -19,7 +19,6 @@ from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import Knob, PlanEntry, multiples
 from jvr.model.ranges import AT_LEAST_ONE, COLOUR, INCREASING, NOT_NEGATIVE, POSITIVE, UNIT_INTERVAL, Interval
 from jvr.model.scene import Scene
-from jvr.model.transfer import Classified
 from jvr.numerics import direction_and_length
 from jvr.types import ArrayLike, Scalar, Triple
 
@@ -129,7 +128,7 @@ class Isosurfaces(AbstractSurfaces):
     def shown(self, medium: Medium, rays: Rays, hits: Hits) -> tuple[Triple, Float[Array, "rays"]]:
         colour = self._colour(hits)
         opacity = hits.found.astype(rays.length.dtype) if self.opacity is None else _own(self.opacity, hits)
-        shader = _lit(medium.shader)
+        shader = surface_shader(medium.shader)
         if shader is None:
             return colour, opacity
         factor, added, _ = _reflected(shader, medium, rays, hits, colour, self.values[hits.surface])
@@ -137,7 +136,7 @@ class Isosurfaces(AbstractSurfaces):
         return tuple(jnp.where(hits.found, c, 0.0) for c in lit), opacity
 
     def apart(self, medium: Medium, rays: Rays, hits: Hits) -> SurfaceLayers:
-        diffuse, shader, value = self._colour(hits), _lit(medium.shader), self.values[hits.surface]
+        diffuse, shader, value = self._colour(hits), surface_shader(medium.shader), self.values[hits.surface]
         if shader is None:
             specular, sample = (jnp.zeros_like(hits.u),) * 3, _sampled(medium.shader, medium, rays, hits, value)[1]
         else:
@@ -168,12 +167,6 @@ def hit_points(rays: Rays, hits: Hits) -> Point:
     return points_at(still, jnp.arange(zero.size, dtype=jnp.int32), zero, hits.u)
 
 
-def _lit(shader: Any) -> LitShader | None:
-    """A shader that shades surfaces, or `None`."""
-    lit = isinstance(shader, LitShader) and (shader.shading is not None or shader.environment is not None)
-    return shader if lit else None
-
-
 def _sampled(shader: Any, medium: Medium, rays: Rays, hits: Hits, value: Float[Array, "rays"]) -> tuple[Point, Sample]:
     """Where rays hit surfaces of isovalues, and what is known there in the world, with the light that reaches it."""
     point = hit_points(rays, hits)
@@ -190,13 +183,5 @@ def _reflected(
 ) -> tuple[Triple, Triple, Sample]:
     """What surfaces of a colour and an isovalue reflect of it, what they add in the colour of the light, and what is known where they
     are."""
-    # A surface does not scatter as a medium does, and where it is cut there is none of it.
-    shader = LitShader(
-        shader.optical, shader.frame, shader.world_from_grid, shader.lights, shader.shading, None, None, shader.environment
-    )
     point, sample = _sampled(shader, medium, rays, hits, value)
-    classified = Classified(colour, (jnp.zeros_like(hits.u),))
-    none = jnp.zeros((), hits.u.dtype)
-    light_at = lambda sample, point, classified: shader.light_at(sample, point, classified, none, is_surface=True)
-    factor, added = jax.vmap(light_at)(sample, point, classified)
-    return factor, added, sample
+    return *reflected(shader, sample, point, colour), sample

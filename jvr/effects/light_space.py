@@ -156,7 +156,7 @@ def rays_through(space: AbstractLightSpace, scene: Scene, u: Float[Array, "rays"
     if scene.light_blocker is None:
         return light
     begin = jnp.broadcast_to(-space.upstream, light.length.shape)
-    return light._replace(ends=scene.light_blocker.hit(line, 0.0, begin, None)[0])
+    return light._replace(ends=scene.light_blocker.hit(line, 0.0, begin, None).distance)
 
 
 def depth_nodes(

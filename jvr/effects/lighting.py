@@ -119,6 +119,24 @@ class LitShader(OpticalShader):
         return tuple(factor), tuple(added)
 
 
+def surface_shader(shader: Any) -> LitShader | None:
+    """The shader of surfaces in what a shader shades, or `None` where that shades none. A surface does not scatter as a medium does, and
+    where it is cut there is none of it."""
+    if not isinstance(shader, LitShader) or (shader.shading is None and shader.environment is None):
+        return None
+    return LitShader(
+        shader.optical, shader.frame, shader.world_from_grid, shader.lights, shader.shading, None, None, shader.environment
+    )
+
+
+def reflected(shader: LitShader, sample: Sample, points: Point, colour: Triple) -> tuple[Triple, Triple]:
+    """What points of surfaces of a colour reflect of it, and what they add in the colour of the light; `shader`: a `surface_shader`."""
+    zero = jnp.zeros_like(colour[0])
+    none = jnp.zeros((), zero.dtype)
+    light_at = lambda sample, point, classified: shader.light_at(sample, point, classified, none, is_surface=True)
+    return jax.vmap(light_at)(sample, points, Classified(colour, (zero,)))
+
+
 class LitPreIntegratedShader(LitShader, PreIntegratedShader):
     """Pre-integration in a lit medium: the scalar linear along a segment, the light that of the mean of its ends."""
 

@@ -96,7 +96,7 @@ class RayVisibility(AbstractVisibility):
         """From the points to a light; without length where they are not wanted, or geometry is in the way, and where that is."""
         ways = ways_to(light, self.volume, self.clipping, points.p)
         length = ways.end if self.reach is None else smaller(ways.end, self.reach)
-        blocked = None if self.geometry is None else self.geometry.hit(ways.world, 0.0, 0.0, None)[0] < ways.distance
+        blocked = None if self.geometry is None else self.geometry.hit(ways.world, 0.0, 0.0, None).distance < ways.distance
         reaches = wanted & (length > 0) if blocked is None else wanted & (length > 0) & ~blocked
         keep = lambda v: tuple(jnp.where(reaches, c, 0.0) for c in v)
         return Rays(keep(points.p), keep(ways.along), jnp.where(reaches, length, 0.0)), blocked

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jvr.model.geometry import Face
 from jvr.numerics import larger
 from jvr.types import Channels, Scalar, Triple
 
@@ -20,12 +21,14 @@ class End(NamedTuple):
 
     - `rgb`: radiance that arrives from there, without that of a background of one colour;
     - `opaque`: 1 where a ray ends at something opaque, 0 where it goes on to what is far away;
-    - `distance`: world length from the ray's entry to what is opaque, 0 where nothing is.
+    - `distance`: world length from the ray's entry to what is opaque, 0 where nothing is;
+    - `face`: where it ends at geometry of which `rgb` is the colour, until the light there is known; else `None`.
     """
 
     rgb: Triple
     opaque: Float[Array, "rays"]
     distance: Float[Array, "rays"]
+    face: Face | None = None
 
 
 class Rays(NamedTuple):

@@ -3,7 +3,7 @@
 import abc
 import os
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +19,24 @@ from jvr.model.ranges import RADIANCE, Interval
 from jvr.types import ArrayLike, Triple
 
 DISTANCE = Interval(low=0.0, takes_infinity=True)
+
+
+class Face(NamedTuple):
+    """Where rays meet geometry that light falls on: the position in the world, above it on the side of the eye by so much that a ray from
+    there to a light does not meet it by rounding; the unit normal on that side; and the unit direction to the eye."""
+
+    x: Triple
+    normal: Triple
+    w_o: Triple
+
+
+class Met(NamedTuple):
+    """Where rays meet geometry: how far from their origins, infinite for those that meet nothing; the radiance that they see there, or
+    where there is a `face`, which light falls on, its colour."""
+
+    distance: Float[Array, "rays"]
+    rgb: Triple
+    face: Face | None = None
 
 
 class AbstractGeometry(AbstractPart):
@@ -41,9 +59,8 @@ class AbstractGeometry(AbstractPart):
         behind: Float[Array, "rays"] | float,
         nearest: Float[Array, "rays"] | float,
         pixels: Int[Array, "rays"] | None,
-    ) -> tuple[Float[Array, "rays"], Triple]:
-        """How far from their origins rays of unit direction end, infinite for those that meet nothing, and the radiance that they see
-        there.
+    ) -> Met:
+        """Where rays of unit direction end.
 
         `rays`: in the world; `behind`: how far behind their origins the eye is; `nearest`: the distance from their origins from which on
         anything is met; `pixels`: `row * width + column` of each, `None` for rays that are of no pixel.
@@ -56,14 +73,18 @@ class AbstractGeometry(AbstractPart):
     def check_view(self, camera: AbstractCamera) -> None:
         """**Raises** `ValueError` for a camera whose rays it does not know."""
 
+    def check_light(self, shading: Any, material: Any) -> None:
+        """**Raises** `ValueError` for a scene's shading and material, or what there is of them, that it cannot be shaded by."""
+
 
 class DepthImage(AbstractGeometry):
     """Opaque geometry as one camera sees it, pixel by pixel: what another renderer, or `jvr.render`, made of it.
 
     **Arguments:** `depth`: `(height, width)`, the distance from the eye along each ray as `jvr.Rendering.depth` has it (not along the axis
     of view, as depth buffers have it), 0 or infinite where there is nothing; `rgb`: `(height, width, 3)`, the linear radiance of the
-    geometry. Both are differentiable: as depth moves, so does how much medium is in front; at the edges of things, where pixels change
-    what they show, there is no derivative.
+    geometry, in the light that it was drawn in: it has no normals, and lights and shadows of the scene do not change it. Both are
+    differentiable: as depth moves, so does how much medium is in front; at the edges of things, where pixels change what they show, there
+    is no derivative.
 
     It is that of one view: a camera of another size is refused, and so is what looks between pixels or from elsewhere (`jvr.Refinement`,
     `jvr.Slices`, fits of several views). **Raises** `ValueError` for distances that are negative or NaN, and for shapes that do not fit.
@@ -115,7 +136,7 @@ class DepthImage(AbstractGeometry):
         behind: Float[Array, "rays"] | float,
         nearest: Float[Array, "rays"] | float,
         pixels: Int[Array, "rays"] | None,
-    ) -> tuple[Float[Array, "rays"], Triple]:
+    ) -> Met:
         if pixels is None:
             raise ValueError(
                 "a jvr.DepthImage is known in the pixels of its camera alone: leave Settings(sampling=...) at jvr.Uniform(), or give a "
@@ -124,4 +145,4 @@ class DepthImage(AbstractGeometry):
         depth, rgb = jnp.ravel(self.depth)[pixels], self.rgb.reshape(-1, 3)[pixels]
         there = (depth > 0) & (depth < jnp.inf)
         t = jnp.where(there, jnp.where(there, depth, 0.0) - behind, jnp.inf)
-        return jnp.where(t < nearest, jnp.inf, t), (rgb[:, 0], rgb[:, 1], rgb[:, 2])
+        return Met(jnp.where(t < nearest, jnp.inf, t), (rgb[:, 0], rgb[:, 1], rgb[:, 2]))

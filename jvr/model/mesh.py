@@ -12,14 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jvr.model.by_value import is_varying
 from jvr.model.checks import known
 from jvr.model.clipping import Line
 from jvr.model.exact import Exact
-from jvr.model.geometry import AbstractGeometry
-from jvr.model.parameters import assign, parameter
+from jvr.model.geometry import AbstractGeometry, Face, Met
+from jvr.model.material import HarmonicMaterial, MaterialByValue
+from jvr.model.parameters import assign, choice, parameter
 from jvr.model.parts import PlanEntry
 from jvr.model.ranges import RADIANCE
-from jvr.numerics import cross, dot
+from jvr.numerics import cross, direction_and_length, dot
 from jvr.types import ArrayLike, Triple
 
 # Triangles in a block, and rays that look at a block together.
@@ -28,35 +30,56 @@ BLOCK, TOGETHER = 32, 1024
 STEPS = 1024
 # How far beyond an edge a ray still meets a triangle, of its sides: between two that share an edge no ray gets through.
 EDGE = 1e-6
+# How far above a triangle rays to lights begin, in roundings of the largest number that goes into where it was met.
+LIFT = 64
 
 
 class Mesh(AbstractGeometry):
-    """Opaque geometry as triangles, seen from both sides in its own colours; lights do not change them. It shades the medium: it ends the
-    rays of the lights of a scene with shadows, and no derivative knows how its shadows move.
+    """Opaque geometry as triangles, seen from both sides.
+
+    Without lights and shading it shows its `rgb`, as the medium does; with them each triangle is shaded by the scene's `shading`, or its
+    `material` under environment lighting, with its own normal on the side of the eye. In a scene with `shadows` it shades the medium,
+    isosurfaces and itself, and lies in the shadows of all of these: a ray from each point that is seen to each light, by the scene's
+    `jvr.ShadowRays` or, where another method finds the shadows of the medium, by those of default steps. `occlusion` takes ambient light
+    from it inside of the volume, but that of isosurfaces takes none.
 
     **Arguments:** `vertices`: `(n, 3)`, positions in the world; `faces`: `(m, 3)`, whole numbers: which three vertices a triangle has;
-    `rgb`: the linear radiance of each vertex, `(n, 3)`, between which it is interpolated, or of all, `(3,)`. Differentiable in `vertices`
-    and `rgb`, and in where rays run; which triangle a ray meets is detached: what comes into sight at a silhouette has no derivative.
+    `rgb`: the linear colour of each vertex, `(n, 3)`, between which it is interpolated, or of all, `(3,)`; `lit`: whether lights change
+    it; if not, `rgb` is the radiance that is seen.
 
-    **Raises** `ValueError` for a mesh without faces, vertices that are not finite and faces of vertices that there are not.
+    Differentiable in `vertices`, also by its normals, and `rgb`, in where rays run, and in the lights and the medium that they pass. Which
+    triangle a ray meets is detached: what comes into sight at a silhouette, and how the edges of its shadows move, has no derivative.
+
+    **Raises** `ValueError` for a mesh without faces, vertices that are not finite and faces of vertices that there are not; and in a scene
+    whose shading or material goes by the scalar or its gradient, which a mesh does not have.
     """
 
     faces: Int[Array, "faces 3"]
     vertices: Float[Array, "vertices 3"] = parameter(doc="x, y, z", unit="mm")
-    rgb: Float[Array, "..."] = parameter(RADIANCE, doc="radiance of each vertex, or of all", shapes=(("vertices", 3), (3,)))
+    rgb: Float[Array, "..."] = parameter(RADIANCE, doc="colour of each vertex, or of all", shapes=(("vertices", 3), (3,)))
+    lit: bool = choice(doc="whether the lights of a scene change it")
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike, rgb: ArrayLike):
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike, rgb: ArrayLike, *, lit: bool = True):
         points = known(vertices)
         if points is not None and not np.all(np.isfinite(np.asarray(points, float))):
             raise ValueError("vertices of a mesh must be finite: take those that are not out of it, with their faces")
-        assign(self, vertices=vertices, rgb=rgb)
+        assign(self, vertices=vertices, rgb=rgb, lit=lit)
         self.faces = _triangles(faces, len(self.vertices))
 
     def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
-        return (PlanEntry(name, True, f"rays end at a mesh of {len(self.faces):,} triangles"),)
+        lit = ", which is lit" if self.lit and scene.shades_surfaces else ""
+        return (PlanEntry(name, True, f"rays end at a mesh of {len(self.faces):,} triangles{lit}"),)
 
     def moved(self, origin: Exact) -> "Mesh":
-        return Mesh(Exact(self.vertices, jnp.zeros_like(self.vertices)).minus(origin).rounded(), self.faces, self.rgb)
+        vertices = Exact(self.vertices, jnp.zeros_like(self.vertices)).minus(origin).rounded()
+        return Mesh(vertices, self.faces, self.rgb, lit=self.lit)
+
+    def check_light(self, shading: Any, material: Any) -> None:
+        by_scalar = isinstance(material, MaterialByValue | HarmonicMaterial) and material.positions.size > 1
+        if self.lit and (by_scalar or is_varying((shading, material))):
+            raise ValueError(
+                "a mesh has no scalar or gradient for a shading or a material to go by: give numbers, or jvr.Mesh(..., lit=False)"
+            )
 
     def hit(
         self,
@@ -64,13 +87,15 @@ class Mesh(AbstractGeometry):
         behind: Float[Array, "rays"] | float,
         nearest: Float[Array, "rays"] | float,
         pixels: Int[Array, "rays"] | None,
-    ) -> tuple[Float[Array, "rays"], Triple]:
+    ) -> Met:
         found = first_triangle(self, rays, jnp.broadcast_to(nearest, rays[0][0].shape))
         corners = self.faces[jnp.maximum(found, 0)]
-        t, weights = _meet(_components(self.vertices[corners]), rays)
+        triangles = _components(self.vertices[corners])
+        t, weights = _meet(triangles, rays)
         at = lambda c: self.rgb[c] if self.rgb.ndim == 1 else dot(weights, tuple(self.rgb[corners[:, i], c] for i in range(3)))
         rgb = tuple(jnp.broadcast_to(at(c), t.shape) for c in range(3))
-        return jnp.where(found < 0, jnp.inf, t), rgb
+        face = _face(triangles, rays, jnp.where(found < 0, 0.0, t)) if self.lit else None
+        return Met(jnp.where(found < 0, jnp.inf, t), rgb, face)
 
 
 class _Blocks(NamedTuple):
@@ -129,8 +154,7 @@ def _meet(corners: tuple[Triple, ...], rays: Line) -> tuple[Float[Array, "..."],
     """How far along rays the planes of triangles are, and the weights of the corners there, -1 for rays along a plane."""
     origin, direction = rays
     first, second, third = corners
-    minus = lambda a, b: tuple(x - y for x, y in zip(a, b, strict=True))
-    side, other, offset = minus(second, first), minus(third, first), minus(origin, first)
+    side, other, offset = _minus(second, first), _minus(third, first), _minus(origin, first)
     p, q = cross(direction, other), cross(offset, side)
     volume = dot(side, p)
     flat = volume == 0
@@ -138,6 +162,25 @@ def _meet(corners: tuple[Triple, ...], rays: Line) -> tuple[Float[Array, "..."],
     u, v = dot(offset, p) * inverse, dot(direction, q) * inverse
     weights = tuple(jnp.where(flat, -1.0, w) for w in (1 - u - v, u, v))
     return dot(other, q) * inverse, weights
+
+
+def _face(corners: tuple[Triple, ...], rays: Line, t: Float[Array, "rays"]) -> Face:
+    """What light falls on where rays meet triangles at a distance."""
+    origin, direction = rays
+    first, second, third = corners
+    # Of unit sides, whose products neither overflow nor underflow.
+    side, other = (direction_and_length(_minus(corner, first))[0] for corner in (second, third))
+    normal, _ = direction_and_length(cross(side, other))
+    away = dot(normal, direction) > 0
+    normal = tuple(jnp.where(away, -c, c) for c in normal)
+    largest = functools.reduce(jnp.maximum, (jnp.abs(c) for point in (origin, *corners) for c in point), jnp.abs(t))
+    lift = jax.lax.stop_gradient(LIFT * jnp.finfo(t.dtype).eps * largest)
+    x = tuple(o + t * d + lift * n for o, d, n in zip(origin, direction, normal, strict=True))
+    return Face(x, normal, tuple(-d for d in direction))
+
+
+def _minus(a: Triple, b: Triple) -> Triple:
+    return tuple(x - y for x, y in zip(a, b, strict=True))
 
 
 def _through_box(lower: Triple, upper: Triple, rays: Line) -> tuple[Float[Array, "rays"], Float[Array, "rays"]]:

@@ -123,6 +123,8 @@ class Scene(AbstractPart):
         _check_environment(self)
         _check_surfaces(self)
         _check_specular(self)
+        if geometry is not None:
+            geometry.check_light(shading, material)
 
     def current(self) -> "Scene":
         """The same scene with nothing in it that was computed for another: `Volume.current()`, and each precomputed part `checked`. What
@@ -152,6 +154,11 @@ class Scene(AbstractPart):
     def shows_light(self) -> bool:
         """Whether anything in it shows light, of lights or of the environment."""
         return self.shows_lights or any(part.shows_environment for _, part in parts_of(self))
+
+    @property
+    def shades_surfaces(self) -> bool:
+        """Whether the light that falls on a surface is what it shows."""
+        return self.shading is not None or self.material is not None
 
     @property
     def ends_rays(self) -> bool:

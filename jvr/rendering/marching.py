@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jvr.march.march import Marched, MarchOptions
 from jvr.march.steps import Rays
 from jvr.model.scene import Scene
+from jvr.rendering.geometry import lit_where_rays_end
 from jvr.rendering.integrator import AbstractRayIntegrator, Radiance
 from jvr.rendering.medium import Prepared, medium
 from jvr.rendering.specular import seen_in_mirrors
@@ -27,6 +28,7 @@ class Uniform(AbstractRayIntegrator):
         settings = prepared.settings
         options = MarchOptions(settings.termination, True)
         through, surfaces = medium(prepared), prepared.scene.surfaces
+        rays = lit_where_rays_end(prepared, through, rays)
         if surfaces is None:
             gathered = settings.adjoint.march(options, through, rays.without_end, prepared.dt)
             return radiance_of(prepared.scene, gathered, rays)

@@ -18,6 +18,7 @@ from jvr.march.medium import Medium
 from jvr.march.segments import channel_counts
 from jvr.march.steps import Rays
 from jvr.numerics import transformed
+from jvr.rendering.geometry import lit_where_rays_end
 from jvr.rendering.integrator import Radiance
 from jvr.rendering.medium import Prepared
 from jvr.rendering.surfaces import Seen, behind_layer, behind_stretch, nothing_seen, spread
@@ -144,10 +145,10 @@ def _walk(prepared: Prepared, medium: Medium, path: _Path, seen: Seen, step: _St
         path.on & hits.found & _bright(prepared, clear),
     )
     crosses = jnp.ones_like(path.on)
-    mirrored = sent_on(_sent(prepared, way, hits, mirror), through(tuple(c * fraction for c in before)), ~crosses)
+    mirrored = sent_on(_sent(prepared, medium, way, hits, mirror), through(tuple(c * fraction for c in before)), ~crosses)
     rest = _rest(rays, hits)
     if specular.bends:
-        bent = _sent(prepared, way, hits, onward)
+        bent = _sent(prepared, medium, way, hits, onward)
         rest = jax.tree.map(lambda a, b: jnp.where(step.specular, a, b), bent, rest)
     return seen, mirrored._replace(direct=jnp.zeros_like(at)), sent_on(rest, through(passing), crosses)
 
@@ -157,10 +158,11 @@ def _bright(prepared: Prepared, clear: Channels) -> Bool[Array, "rays"]:
     return jnp.max(jnp.stack(clear), axis=0) > prepared.settings.termination
 
 
-def _sent(prepared: Prepared, rays: Rays, hits: Any, direction: Triple) -> Rays:
+def _sent(prepared: Prepared, medium: Medium, rays: Rays, hits: Any, direction: Triple) -> Rays:
     """Rays from where others hit a surface, in a direction of the world, to where they leave the volume."""
     p = tuple(jnp.where(hits.found, e + hits.u * d, e) for e, d in zip(rays.entry, rays.direction, strict=True))
-    return enter(prepared.scene, transformed(prepared.scene.volume.world_from_grid, p), direction)[0]
+    sent = enter(prepared.scene, transformed(prepared.scene.volume.world_from_grid, p), direction)[0]
+    return lit_where_rays_end(prepared, medium, sent)
 
 
 def _rest(rays: Rays, hits: Any) -> Rays:

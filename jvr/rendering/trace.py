@@ -12,7 +12,7 @@ from jvr.march.steps import End, Rays
 from jvr.model.camera import AbstractCamera, Limits
 from jvr.model.clipping import Line, interval_inside, moved_clipping
 from jvr.model.environment_map import EnvironmentMap
-from jvr.model.geometry import AbstractGeometry
+from jvr.model.geometry import Met
 from jvr.model.scene import Scene
 from jvr.numerics import larger, one_minus_exp, smaller
 from jvr.types import Scalar, Triple
@@ -72,7 +72,8 @@ def enter(
     """World rays inside the volume (and its clipping), and the distance from the eye, which is `behind` their origin by so much, to
     where they enter.
 
-    They end at opaque geometry, and where what is behind differs from ray to ray, they know what they see there. `pixels`: of each, `None`
+    They end at opaque geometry, and where what is behind differs from ray to ray, they know what they see there, or of geometry that is
+    lit its colour (`jvr.rendering.geometry.lit_where_rays_end`). `pixels`: of each, `None`
     where they are of none (`jvr.model.geometry.AbstractGeometry.hit`); `limits`: distances from their origins between which anything is
     seen. A ray with non-finite numbers gets the length NaN, which
     `composite` turns into a NaN pixel.
@@ -83,8 +84,8 @@ def enter(
     near, far = limits
     nearest = -behind if near is None else larger(near, -behind)
     t_in, t_out = larger(t_in, nearest), t_out if far is None else smaller(t_out, far)
-    met = None if scene.geometry is None else _met(scene.geometry, (origin, direction), (behind, nearest, far), pixels)
-    t_out = t_out if met is None else smaller(t_out, met[0])
+    met = None if scene.geometry is None else _met(scene, (origin, direction), (behind, nearest, far), pixels)
+    t_out = t_out if met is None else smaller(t_out, met.distance)
     hit = t_out > t_in
     # Those that miss are counted from the eye.
     end = _end(scene, direction, met, jnp.where(hit, t_in, -behind))
@@ -98,22 +99,22 @@ def enter(
 
 
 def _met(
-    geometry: AbstractGeometry,
+    scene: Scene,
     rays: Line,
     distances: tuple[Float[Array, "rays"] | float, Float[Array, "rays"] | float, Float[Array, "rays"] | None],
     pixels: Int[Array, "rays"] | None,
-) -> tuple[Float[Array, "rays"], Triple]:
-    """Where rays meet geometry, no nearer and no farther than the `distances` say, and its radiance there."""
+) -> Met:
+    """Where rays meet geometry, no nearer and no farther than the `distances` say; with its faces where the scene shades them."""
     behind, nearest, far = distances
-    t, rgb = geometry.hit(rays, behind, nearest, pixels)
-    return t if far is None else jnp.where(t > far, jnp.inf, t), rgb
+    assert scene.geometry is not None
+    met = scene.geometry.hit(rays, behind, nearest, pixels)
+    met = met if scene.shades_surfaces else met._replace(face=None)
+    return met if far is None else met._replace(distance=jnp.where(met.distance > far, jnp.inf, met.distance))
 
 
-def _end(
-    scene: Scene, direction: Triple, met: tuple[Float[Array, "rays"], Triple] | None, t_in: Float[Array, "rays"]
-) -> End | None:
-    """What rays end at that enter at `t_in`, `None` where that is a background of one colour or nothing at all. `met`: how far away
-    geometry is, and its radiance."""
+def _end(scene: Scene, direction: Triple, met: Met | None, t_in: Float[Array, "rays"]) -> End | None:
+    """What rays end at that enter at `t_in`, `None` where that is a background of one colour or nothing at all. `met`: where they meet
+    geometry."""
     nothing = jnp.zeros_like(direction[0])
     far, end = (nothing,) * 3, None
     if isinstance(scene.background, EnvironmentMap):
@@ -122,10 +123,10 @@ def _end(
         end = End(far, nothing, nothing)
     if met is None:
         return end
-    t, rgb = met
+    t, rgb, face = met
     there = t < jnp.inf
     colours = tuple(jnp.where(there, near, behind) for near, behind in zip(rgb, far, strict=True))
-    return End(colours, there.astype(t.dtype), jnp.where(there, jnp.where(there, t, 0.0) - t_in, 0.0))
+    return End(colours, there.astype(t.dtype), jnp.where(there, jnp.where(there, t, 0.0) - t_in, 0.0), face)
 
 
 def camera_rays(scene: Scene, camera: AbstractCamera, pixels: Int[Array, "rays"]) -> tuple[Rays, Float[Array, "rays"]]:

@@ -44,7 +44,7 @@ def rays(n, seed=0):
 
 def met(mesh, origin, direction, nearest=0.0):
     of = lambda x: tuple(jnp.asarray(x, mesh.vertices.dtype).T)
-    return jax.jit(lambda m, o, d: m.hit((of(o), of(d)), 0.0, nearest, None))(mesh, origin, direction)
+    return jax.jit(lambda m, o, d: m.hit((of(o), of(d)), 0.0, nearest, None)[:2])(mesh, origin, direction)
 
 
 def solved(vertices, faces, origin, direction, nearest=0.0):

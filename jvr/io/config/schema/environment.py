@@ -71,6 +71,7 @@ class MeshTable(KindTable):
     vertices: Annotated[list[Position], Field(min_length=1)]
     faces: Annotated[list[list[int]], Field(min_length=1)]
     rgb: Colour | list[Colour]
+    lit: bool = True
 
     @staticmethod
     def part(**keywords: Any) -> Any:
