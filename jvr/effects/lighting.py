@@ -17,8 +17,9 @@ from jvr.effects.cut import CutFaces
 from jvr.effects.environment_lighting import EnvironmentLighting, environment_lighting_of
 from jvr.effects.self_shadow import ShadedSegment
 from jvr.effects.shading import surface_weight
+from jvr.march.medium import LightPath, Medium
 from jvr.march.shaders import GradientFrame, OpticalShader, PreIntegratedShader, where_known
-from jvr.march.steps import Point, Sample
+from jvr.march.steps import End, Point, Sample
 from jvr.model.by_value import at_sample
 from jvr.model.clipping import parts_of_clipping
 from jvr.model.effects import AbstractScattering, AbstractShading
@@ -135,6 +136,20 @@ def reflected(shader: LitShader, sample: Sample, points: Point, colour: Triple) 
     none = jnp.zeros((), zero.dtype)
     light_at = lambda sample, point, classified: shader.light_at(sample, point, classified, none, is_surface=True)
     return jax.vmap(light_at)(sample, points, Classified(colour, (zero,)))
+
+
+def radiance_of_geometry(scene: Scene, path: LightPath, search: Any, medium: Medium, end: End) -> Triple:
+    """What rays see where they end, of geometry in the light that `medium` shows. `path`: of light through the scene; `search`: what its
+    surfaces are found by."""
+    # Scenes without any do without its modules.
+    from jvr.effects.lit_geometry import light_on_geometry
+
+    shader = surface_shader(medium.shader)
+    assert shader is not None
+    at, sample = light_on_geometry(scene, path, search, medium.visibility, end)
+    factor, added = reflected(shader, sample, at, end.rgb)
+    lit = (c * a + b for c, a, b in zip(end.rgb, factor, added, strict=True))
+    return tuple(jnp.where(end.opaque > 0, c, far) for c, far in zip(lit, end.rgb, strict=True))
 
 
 class LitPreIntegratedShader(LitShader, PreIntegratedShader):

@@ -1,4 +1,4 @@
-"""Geometry in the light of a scene: shaded as isosurfaces are, with the light that reaches it wherever it is, in the volume or not."""
+"""The light that reaches geometry, in the volume or outside of it: `jvr.effects.lighting` shades it as it does isosurfaces."""
 
 from typing import Any
 
@@ -6,9 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jvr.effects.lighting import reflected, surface_shader
 from jvr.effects.shadow_rays import ShadowRays, ways_to
-from jvr.march.medium import AbstractVisibility, LightPath, Medium
+from jvr.march.medium import AbstractVisibility, LightPath
 from jvr.march.secondary import points
 from jvr.march.steps import End, Point, Sample, Transmittances
 from jvr.model.clipping import Clipping
@@ -17,7 +16,7 @@ from jvr.model.light import AbstractDeltaLight
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
 from jvr.numerics import larger, rounded_into
-from jvr.types import Channels, Triple
+from jvr.types import Channels
 
 
 class GeometryShadows(eqx.Module):
@@ -48,7 +47,22 @@ class GeometryShadows(eqx.Module):
         return tuple(jnp.where(crosses, T, free.astype(T.dtype)) for T in left)
 
 
-def shadows_on_geometry(scene: Scene, path: LightPath, search: Any) -> GeometryShadows | None:
+def light_on_geometry(
+    scene: Scene, path: LightPath, search: Any, visible: AbstractVisibility | None, end: End
+) -> tuple[Point, Sample]:
+    """Where rays end, and what is known there as of a surface, with the light. `search`: what the scene's surfaces are found by; `visible`:
+    what reaches points of the medium."""
+    face, volume, there = end.face, scene.volume, end.opaque > 0
+    assert face is not None
+    along = volume.grid_from_world(tuple(-c for c in face.w_o), direction=True)
+    at = points(volume.grid_from_world(face.x), along)
+    shadows = _shadows(scene, path, search)
+    lights = () if shadows is None else shadows.transmittances(at, there)
+    light = _around(volume, visible, at, there)._replace(lights=lights)
+    return at, Sample(jnp.zeros_like(end.opaque), tuple(-n for n in face.normal), light=light)
+
+
+def _shadows(scene: Scene, path: LightPath, search: Any) -> GeometryShadows | None:
     """The shadows on the geometry of a scene, `None` where it has none. `search`: what its surfaces are found by. By a ray to each light,
     whatever finds the shadows of the medium: maps and volumes of these are dark in the geometry itself, and end with the volume."""
     if scene.shadows is None or scene.geometry is None:
@@ -60,21 +74,6 @@ def shadows_on_geometry(scene: Scene, path: LightPath, search: Any) -> GeometryS
         visible = None if light is None else method.visibility(alone, path)
         between.append(visible if alone.surfaces is None else alone.surfaces.shadowed(search, alone, visible))
     return GeometryShadows(scene.volume, scene.clipping, scene.geometry, scene.shadow_casters, tuple(between))
-
-
-def radiance(volume: Volume, medium: Medium, shadows: GeometryShadows | None, end: End) -> Triple:
-    """What rays see where they end, of geometry under the lights that `medium` shows."""
-    shader, face, there = surface_shader(medium.shader), end.face, end.opaque > 0
-    assert shader is not None
-    assert face is not None
-    along = volume.grid_from_world(tuple(-c for c in face.w_o), direction=True)
-    at = points(volume.grid_from_world(face.x), along)
-    light = _around(volume, medium.visibility, at, there)
-    light = light._replace(lights=() if shadows is None else shadows.transmittances(at, there))
-    sample = Sample(jnp.zeros_like(end.opaque), tuple(-n for n in face.normal), light=light)
-    factor, added = reflected(shader, sample, at, end.rgb)
-    lit = (c * a + b for c, a, b in zip(end.rgb, factor, added, strict=True))
-    return tuple(jnp.where(there, c, far) for c, far in zip(lit, end.rgb, strict=True))
 
 
 def _around(volume: Volume, visible: AbstractVisibility | None, at: Point, wanted: Bool[Array, "rays"]) -> Transmittances:

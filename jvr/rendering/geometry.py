@@ -1,12 +1,8 @@
 """Rays that end at geometry, in the light of the scene."""
 
-import importlib
-
 from jvr.march.medium import Medium
 from jvr.march.steps import End, Rays
-from jvr.rendering.medium import Prepared, absorbing
-
-LIT_GEOMETRY = "jvr.effects.lit_geometry"
+from jvr.rendering.medium import Prepared, absorbing, lighting_module
 
 
 def lit_where_rays_end(prepared: Prepared, medium: Medium, rays: Rays) -> Rays:
@@ -15,8 +11,5 @@ def lit_where_rays_end(prepared: Prepared, medium: Medium, rays: Rays) -> Rays:
     if end is None or end.face is None:
         return rays
     path = lambda graded: absorbing(scene, prepared.occupancy, graded)
-    # Imported for scenes alone that have any.
-    lit = importlib.import_module(LIT_GEOMETRY)
-    shadows = lit.shadows_on_geometry(scene, path, prepared.search)
-    rgb = lit.radiance(scene.volume, medium, shadows, end)
+    rgb = lighting_module().radiance_of_geometry(scene, path, prepared.search, medium, end)
     return rays._replace(end=End(rgb, end.opaque, end.distance))

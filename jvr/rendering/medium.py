@@ -76,7 +76,7 @@ def prepare(
         visible = visibility(scene, occupied)
         if scene.surfaces is not None:
             visible = scene.surfaces.shadowed(search, scene, visible)
-    lighting = _lighting().prepare(scene) if scene.shows_light else None
+    lighting = lighting_module().prepare(scene) if scene.shows_light else None
     return Prepared(scene, dataclasses.replace(settings, step=1.0), dt, occupied, visible, lighting, search)
 
 
@@ -88,7 +88,7 @@ def medium(prepared: Prepared, *, graded: bool = False) -> Medium:
     quadrature = settings.quadrature
     pre_integrated = quadrature.pre_integrates
     if scene.shows_light:
-        shader = _lighting().lit_shader(scene, frame, prepared.lighting, pre_integrated=pre_integrated)
+        shader = lighting_module().lit_shader(scene, frame, prepared.lighting, pre_integrated=pre_integrated)
     else:
         shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
     if not isinstance(quadrature, PreIntegrated):
@@ -98,7 +98,8 @@ def medium(prepared: Prepared, *, graded: bool = False) -> Medium:
     return Medium(field, table, shader, prepared.occupancy, prepared.visibility)
 
 
-def _lighting() -> Any:
+def lighting_module() -> Any:
+    """What shows light, imported for scenes alone that do."""
     return importlib.import_module(LIGHTING)
 
 

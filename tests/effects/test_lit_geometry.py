@@ -94,6 +94,22 @@ def test_the_umbra_of_a_block_lies_on_the_floor(shadows):
     np.testing.assert_allclose(rgb[~umbra], 0.5 * COSINE * IRRADIANCE, rtol=1e-5)
 
 
+@pytest.mark.slow
+def test_isosurfaces_and_mirrors_know_its_light(x64):
+    """A floor below the volume is dark by what a sheet holds back. In a mirror it is seen with the same light."""
+    volume = jvr.Volume(np.broadcast_to(np.arange(4.0), (17, 17, 4)))
+    clear = jvr.LinearTransfer([0.0, 3.0], np.zeros((2, 3)), [0.0, 0.0])
+    parts = {"lights": (sun(),), "shading": jvr.Lambert(), "shadows": RAYS}
+    sheet = jvr.Isosurfaces([1.6], np.zeros((1, 3)), [0.4])
+    below = jvr.Scene(volume, clear, surfaces=sheet, geometry=square(-2.0), **parts)
+    np.testing.assert_allclose(seen_behind(below, above())[1, 1], 0.6 * RGB * COSINE * IRRADIANCE, rtol=1e-6)
+    # A ceiling, lit from below, in a mirror that looks up.
+    parts = {"lights": (jvr.DirectionalLight([0.0, 0.6, 0.8], IRRADIANCE),), "shading": jvr.Lambert(), "shadows": None}
+    mirror = {"surfaces": jvr.Isosurfaces([1.6], np.zeros((1, 3))), "specular": jvr.Specular(1.0, order=1)}
+    scene = jvr.Scene(volume, clear, geometry=square(20.0), **mirror, **parts)
+    np.testing.assert_allclose(render(scene, above(), EXACT).rgb[1, 1], RGB * 0.8 * IRRADIANCE, rtol=1e-6)
+
+
 def ball(centre, radius, n=12):
     """Triangles of a sphere: convex."""
     theta, phi = np.meshgrid(np.pi * np.arange(n + 1) / n, 2 * np.pi * np.arange(2 * n) / (2 * n), indexing="ij")
