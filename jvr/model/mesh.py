@@ -32,6 +32,8 @@ STEPS = 1024
 EDGE = 1e-6
 # How far above a triangle rays to lights begin, in roundings of the largest number that goes into where it was met.
 LIFT = 64
+# Roundings of the product of its sides below which the volume of a triangle and a ray's direction is none.
+FLAT = 8
 
 
 class Mesh(AbstractGeometry):
@@ -151,13 +153,16 @@ def _components(corners: Float[Array, "*many 3 3"]) -> tuple[Triple, ...]:
 
 
 def _meet(corners: tuple[Triple, ...], rays: Line) -> tuple[Float[Array, "..."], Triple]:
-    """How far along rays the planes of triangles are, and the weights of the corners there, -1 for rays along a plane."""
+    """How far along rays the planes of triangles are, and the weights of the corners there, -1 for rays along a plane, and
+    for triangles without area."""
     origin, direction = rays
     first, second, third = corners
     side, other, offset = _minus(second, first), _minus(third, first), _minus(origin, first)
     p, q = cross(direction, other), cross(offset, side)
     volume = dot(side, p)
-    flat = volume == 0
+    # What rounding leaves of no volume: of a triangle without area, and of a ray in its plane.
+    size = lambda v: jnp.maximum(jnp.maximum(jnp.abs(v[0]), jnp.abs(v[1])), jnp.abs(v[2]))
+    flat = jnp.abs(volume) <= jax.lax.stop_gradient(FLAT * jnp.finfo(volume.dtype).eps * size(side) * size(other))
     inverse = jnp.where(flat, 0.0, 1.0 / jnp.where(flat, 1.0, volume))
     u, v = dot(offset, p) * inverse, dot(direction, q) * inverse
     weights = tuple(jnp.where(flat, -1.0, w) for w in (1 - u - v, u, v))

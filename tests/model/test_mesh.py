@@ -91,6 +91,18 @@ def test_no_ray_gets_through_where_triangles_meet():
     np.testing.assert_allclose(t, 3 - np.linalg.norm(target, axis=1), atol=1e-4)
 
 
+def test_triangles_without_area_are_met_by_no_ray():
+    """In single precision, in which two corners that are the same still have a volume with most directions."""
+    rng = np.random.default_rng(3)
+    first, second = rng.random((2, 40, 3)).astype(np.float32)
+    vertices, faces = np.concatenate([first, second]), [[i, i + 40, i + 40] for i in range(40)]
+    along, at = rng.normal(size=(8000, 3)), np.arange(8000) % 40
+    direction = along / np.linalg.norm(along, axis=1, keepdims=True)
+    target = first[at] + rng.random((8000, 1)) * (second - first)[at]
+    t, _ = met(jvr.Mesh(vertices, faces, (1.0, 1.0, 1.0)), target - 3 * direction, direction)
+    assert np.all(np.isinf(t))
+
+
 @pytest.mark.slow
 def test_a_square_in_fog_is_seen_through_what_is_in_front(x64):
     """As a depth image of the same distances is."""
