@@ -32,7 +32,7 @@ def surfaces(of: Subject) -> dict[str, jvr.Scene]:
     return {
         "isosurface, opaque": change(one),
         "isosurfaces, blended": change(jvr.Isosurfaces([outer, inner], [skin, bone], [0.35, 1.0])),
-        "mirror": change(smooth, specular=jvr.Specular(0.7, order=2), background=surroundings(of)),
+        "mirror": change(smooth, specular=jvr.Specular(0.7, order=2), background=surroundings(of, plain=True)),
         "glass": change(
             jvr.Isosurfaces([outer, inner], [[0.0, 0.0, 0.0], bone], [0.0, 1.0], most=2),
             specular=jvr.Specular(index=[1.3, 1.5], order=2),
@@ -47,15 +47,15 @@ def around(of: Subject) -> dict[str, jvr.Scene]:
     """What is behind the volume and in it, what is cut away, and light of its own."""
     change = lambda **parts: dataclasses.replace(of.scene, **parts)
     table, radius = of.table, float(of.scene.volume.radius)
-    thin = jvr.LutTransfer(table.rgb, 3 * of.cloud * np.asarray(table.sigma_t), table.domain)
+    thin = lambda share: jvr.LutTransfer(table.rgb, share * of.cloud * np.asarray(table.sigma_t), table.domain)
     plane = jvr.ClippingPlane(of.beside(0.12, 0.1, 0.0), of.beside(0.6, 0.5, 0.6) - of.beside(0.0, 0.0, 0.0))
     box = of.scene.clipping
     assert isinstance(box, jvr.ClippingBox)
     bright = 1 + 0.4 * CORNERS @ (of.beside(-0.6, 0.6, 0.6) - of.beside(0.0, 0.0, 0.0))[:, None] / radius
     octahedron = jvr.Mesh(of.beside(0.0, 0.0, 0.0) + 0.3 * radius * CORNERS, FACES, bright * np.array([0.05, 0.45, 0.42]))
     return {
-        "environment map behind": change(transfer=thin, background=surroundings(of)),
-        "mesh in the volume": change(transfer=thin, geometry=octahedron),
+        "environment map behind": change(transfer=thin(3.0), background=surroundings(of)),
+        "mesh in the volume": change(transfer=thin(1.5), geometry=octahedron),
         "depth image behind": change(geometry=floor(of)),
         "clipping plane, oblique": change(clipping=(box, plane)),
         "emission: a flame in smoke": change(transfer=flame(of)),
@@ -95,13 +95,14 @@ def flame(of: Subject) -> jvr.LutTransfer:
     return jvr.LutTransfer(np.full_like(np.asarray(table.rgb), 0.4), smoke, table.domain, glow)
 
 
-def surroundings(of: Subject) -> jvr.EnvironmentMap:
-    """A sky over a floor of squares, which fade towards the horizon."""
+def surroundings(of: Subject, *, plain: bool = False) -> jvr.EnvironmentMap:
+    """A sky over a floor of squares, which fade towards the horizon, or over a plain one, for what curved mirrors would make too small."""
     directions = np.asarray(map_directions(ROWS, 2 * ROWS)[0])
     height = (directions @ of.up)[..., None]
     sky = HORIZON + np.maximum(height, 0) * (ABOVE - HORIZON)
     place = 2.0 * directions[..., :2] / np.maximum(-height, 1e-3)
-    return jvr.EnvironmentMap(np.where(height < 0, tiles(place, np.maximum(-height, 0), HORIZON), sky))
+    ground = HORIZON - np.maximum(-height, 0) * (HORIZON - DARK) if plain else tiles(place, np.maximum(-height, 0), HORIZON)
+    return jvr.EnvironmentMap(np.where(height < 0, ground, sky))
 
 
 def tiles(place: np.ndarray, height: np.ndarray, far: np.ndarray) -> np.ndarray:
