@@ -1,6 +1,7 @@
 """Panels of the contact sheet: isosurfaces, what is around and in a volume, and the light that near matter takes."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -67,15 +68,15 @@ def occlusion(of: Subject) -> dict[str, jvr.Scene]:
     """Ambient light alone, of which near matter takes a part, in the medium and on surfaces; and light of a lamp that is scattered on."""
     ambient = dataclasses.replace(of.scene, lights=(jvr.AmbientLight(1.0),), shading=jvr.Lambert(1.0, 0.0))
     bone = dataclasses.replace(ambient, transfer=clear(of), surfaces=jvr.Isosurfaces([of.isovalues[1]], [of.colours[1]]))
-    around = {"radius": 0.25 * float(of.scene.volume.radius), "resolution": 0.5}
+    near: Any = {"radius": 0.25 * float(of.scene.volume.radius), "resolution": 0.5}
     change = lambda scene, **parts: dataclasses.replace(scene, **parts)
     return {
         "ambient light, no occlusion": ambient,
-        "local occlusion": change(ambient, occlusion=jvr.LocalOcclusion(**around)),
-        "histogram occlusion": change(ambient, occlusion=jvr.HistogramOcclusion(bins=32, clusters=4096, **around)),
+        "local occlusion": change(ambient, occlusion=jvr.LocalOcclusion(**near)),
+        "histogram occlusion": change(ambient, occlusion=jvr.HistogramOcclusion(bins=32, clusters=4096, **near)),
         "surface, no occlusion": bone,
         "surface occlusion": change(bone, occlusion=jvr.SurfaceOcclusion(factor=1.5)),
-        "in-scattering": change(of.scene, shadows=jvr.InScattering(bias=0.1, **around)),
+        "in-scattering": change(of.scene, shadows=jvr.InScattering(bias=0.1, **near)),
     }
 
 
@@ -88,7 +89,8 @@ def clear(of: Subject) -> jvr.LutTransfer:
 def flame(of: Subject) -> jvr.LutTransfer:
     """What is within the inner surface glows and absorbs nothing, in the thin smoke that everything else is."""
     table, (_, inner) = of.table, of.isovalues
-    at = np.linspace(*np.asarray(table.domain), len(table.sigma_t))
+    low, high = np.asarray(table.domain)
+    at = np.linspace(low, high, len(table.sigma_t))
     heat = np.clip((at - inner) / (0.35 * (at[-1] - inner)), 0, 1)[:, None]
     glow = 5 / float(of.scene.volume.radius) * heat * (np.array([1.0, 0.22, 0.02]) + heat * np.array([0.0, 0.4, 0.15]))
     smoke = np.where(at < inner, 2 * of.cloud * np.asarray(table.sigma_t), 0.0)
