@@ -1,36 +1,35 @@
-"""Every effect of light on one sheet: on a CT of a head (`ct_head_quarter`, looked for in `$JVR_DATA`) and on the embedded volume.
+"""Every effect of light on one sheet, and on another isosurfaces, what is around and in a volume, and occlusion: on a CT of a head
+(`ct_head_quarter`, looked for in `$JVR_DATA`) and on the embedded volume.
 
-`python experiments/contact_sheet.py [-o FILE] [--json FILE] [--quick]`; `--figure` is another name of `-o`. Both scenes come from
-configurations (`configs/real/ct_head_lit.toml`, `configs/lit.toml`), and each picture changes the one thing that its title names; JSON
-holds its mean and largest radiance and, for shadows, the error against shadow rays.
+`python experiments/contact_sheet.py [--of light|surfaces] [-o FILE] [--json FILE] [--quick]`; `--figure` is another name of `-o`. Both
+scenes come from configurations (`configs/real/ct_head_lit.toml`, `configs/lit.toml`), and each picture changes the one thing that its title
+names; JSON holds its mean and largest radiance and, for shadows, the error against shadow rays.
 """
 
 import argparse
 import dataclasses
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jvr
 from experiments.accuracy_vs_time import machine
-from experiments.protocols import DATA, HEAD
-from jvr.io.config import build_cameras, build_scene, build_settings, read_config
+from experiments.contact_subjects import Subject, subjects
+from experiments.contact_surfaces import around, occlusion, surfaces
 from jvr.pictures import srgb_from_linear
 
-CONFIGS = Path(__file__).parents[1] / "configs"
 COLUMNS = 6
-# Voxels of every volume.
-SHAPE = (64, 64, 93)
 # By subject and title.
 Pictures: TypeAlias = dict[str, dict[str, np.ndarray]]
+# Scenes by title.
+Group: TypeAlias = Callable[[Subject], dict[str, jvr.Scene]]
 
 METHODS = {
     "shadow rays": jvr.ShadowRays(),
@@ -41,70 +40,6 @@ METHODS = {
 }
 # What share of a picture a detail shows.
 DETAIL = 0.3
-
-
-@dataclasses.dataclass(frozen=True)
-class Subject:
-    """A lit scene, what sees it, and what depends on its units: lengths of the gradient of its surfaces, the share of its extinction that
-    makes it a cloud, and where a detail is looked at."""
-
-    name: str
-    scene: jvr.Scene
-    camera: Any
-    settings: jvr.Settings
-    surface: float
-    cloud: float
-    detail: Sequence[float]
-
-    @property
-    def table(self) -> jvr.LutTransfer:
-        assert isinstance(self.scene.transfer, jvr.LutTransfer)
-        return self.scene.transfer
-
-    def beside(self, sideways: float, upwards: float, back: float) -> np.ndarray:
-        """A place in the world, in radii of the volume from its middle: to the right, upwards in the picture, and towards the eye."""
-        axes = np.asarray(self.camera.world_from_camera)[:3, :3]
-        offset = axes @ np.array([sideways, upwards, back])
-        return np.asarray(self.scene.volume.center) + float(self.scene.volume.radius) * offset
-
-
-def subjects(size: int) -> list[Subject]:
-    """The head where it is there, and the embedded volume."""
-    found = []
-    if (DATA / HEAD).exists():
-        found.append(_subject("CT of a head", "real/ct_head_lit.toml", size, surface=150.0, cloud=0.1, detail=(60.0, 40.0, 60.0)))
-    else:
-        print(f"{HEAD} is not in $JVR_DATA: the sheet shows the embedded volume alone", file=sys.stderr)
-    found.append(_subject("embedded volume", "lit.toml", size, surface=0.04, cloud=0.06, detail=(0.0, -4.0, 12.0)))
-    return found
-
-
-def _subject(name: str, config: str, size: int, **numbers: Any) -> Subject:
-    read = read_config(CONFIGS / config, [f"camera.width={size}", f"camera.height={size}"])
-    scene = build_scene(read)
-    (camera,) = build_cameras(read, scene.volume)
-    return Subject(name, alike(scene), camera, build_settings(read), **numbers)
-
-
-def alike(scene: jvr.Scene) -> jvr.Scene:
-    """The scene with as many voxels, entries and lights as every other, so that an effect is compiled once for all subjects."""
-    old = scene.volume
-    grid = np.meshgrid(*[np.linspace(0, m - 1, n) for m, n in zip(old.shape, SHAPE, strict=True)], indexing="ij")
-    values = jax.jit(jax.vmap(old.sample))(tuple(jnp.asarray(x.ravel(), float) for x in grid))
-    scale = np.diag([*((m - 1) / (n - 1) for m, n in zip(old.shape, SHAPE, strict=True)), 1.0])
-    volume = jvr.Volume(np.asarray(values).reshape(SHAPE), np.asarray(old.world_from_grid) @ scale)
-    key, threshold = cast(Any, scene.lights[0]), cast(Any, scene.shading).threshold
-    box = scene.clipping or jvr.ClippingBox([-1e3] * 3, [1e3] * 3)
-    lights = (dataclasses.replace(key, irradiance=0.65 * key.irradiance), jvr.HeadLight(0.15), jvr.AmbientLight(0.6))
-    shading = jvr.BlinnPhong(0.15, 0.85, 0.4, 30.0, threshold=threshold)
-    parts = {"background": scene.background, "clipping": box, "lights": lights, "shading": shading}
-    return jvr.Scene(volume, _table(scene.transfer), normals=jvr.PrecomputedGradient(), **parts)
-
-
-def _table(transfer: Any) -> jvr.LutTransfer:
-    ends = transfer.positions[0], transfer.positions[-1]
-    at = jax.vmap(transfer.evaluate)(jnp.linspace(*ends, 256))
-    return jvr.LutTransfer(np.stack(at.rgb, axis=-1), np.asarray(at.sigma_t[0]), ends)
 
 
 def shaded(of: Subject) -> dict[str, jvr.Scene]:
@@ -199,6 +134,9 @@ def scattering(of: Subject) -> dict[str, jvr.Scene]:
     return scenes
 
 
+SHEETS = {"light": (shaded, normals, shadowed, lit, scattering), "surfaces": (surfaces, around, occlusion)}
+
+
 def detail_of(of: Subject) -> jvr.PerspectiveCamera:
     """A narrow view of a part of the subject."""
     pose = np.asarray(of.camera.world_from_camera)
@@ -206,10 +144,10 @@ def detail_of(of: Subject) -> jvr.PerspectiveCamera:
     return jvr.PerspectiveCamera.look_at(pose[:3, 3], of.detail, pose[:3, 1], fov_y, of.camera.width, of.camera.height)
 
 
-def pictures(subjects: list[Subject]) -> Pictures:
-    """The linear radiance of all pictures."""
+def pictures(subjects: list[Subject], groups: tuple[Group, ...]) -> Pictures:
+    """The linear radiance of all pictures of groups."""
     titles: list[tuple[str, list[tuple[Subject, jvr.Scene, Any]]]] = []
-    for group in (shaded, normals, shadowed, lit, scattering):
+    for group in groups:
         of_group = {of.name: group(of) for of in subjects}
         camera = detail_of if group is normals else lambda of: of.camera
         for title in of_group[subjects[0].name]:
@@ -264,11 +202,12 @@ def main() -> None:
     """Renders all pictures, prints a line for each, and writes the sheet and JSON on request."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--figure", metavar="FILE", help="PNG of the sheet")
+    parser.add_argument("--of", choices=SHEETS, default="light", help="which sheet")
     parser.add_argument("--json", metavar="FILE")
     parser.add_argument("--quick", action="store_true", help="tiny pictures")
     arguments = parser.parse_args()
     size = 24 if arguments.quick else 160
-    found = pictures(subjects(size))
+    found = pictures(subjects(size), SHEETS[arguments.of])
     if arguments.json:
         Path(arguments.json).write_text(
             json.dumps({"machine": machine(), "size": size, "pictures": rows(found)}, indent=2) + "\n"

@@ -11,7 +11,9 @@ import pytest
 import jvr
 from experiments import (
     contact_sheet,
+    contact_subjects,
     convergence,
+    first_hit_rates,
     occlusion_accuracy,
     other_renderers,
     phase_recovery,
@@ -22,19 +24,20 @@ from experiments import (
     tomography,
 )
 from jvr.io.config import build_fit, build_scene, read_config
+from jvr.model.clipping import parts_of_clipping
 
 
 @pytest.fixture
 def embedded(monkeypatch, tmp_path):
     """No scans are found."""
-    for module in (contact_sheet, shadowed_fit):
+    for module in (contact_subjects, shadowed_fit):
         monkeypatch.setattr(module, "DATA", tmp_path)
 
 
-def ran(module, monkeypatch, tmp_path):
+def ran(module, monkeypatch, tmp_path, *arguments):
     """What the quick experiment writes: its JSON, and the size of its figure."""
     numbers, picture = tmp_path / "numbers.json", tmp_path / "picture.png"
-    monkeypatch.setattr(sys, "argv", ["experiment", "--quick", "--json", str(numbers), "--figure", str(picture)])
+    monkeypatch.setattr(sys, "argv", ["experiment", "--quick", "--json", str(numbers), "--figure", str(picture), *arguments])
     module.main()
     return json.loads(numbers.read_text()), picture.stat().st_size
 
@@ -42,8 +45,7 @@ def ran(module, monkeypatch, tmp_path):
 @pytest.mark.slow
 def test_the_contact_sheet_shows_every_effect_once(embedded):
     (of,) = contact_sheet.subjects(8)
-    groups = [contact_sheet.shaded, contact_sheet.normals, contact_sheet.shadowed, contact_sheet.lit, contact_sheet.scattering]
-    scenes = {title: scene for group in groups for title, scene in group(of).items()}
+    scenes = {title: scene for group in contact_sheet.SHEETS["light"] for title, scene in group(of).items()}
     assert len(scenes) == 5 * contact_sheet.COLUMNS
     shown = {type(part) for s in scenes.values() for part in (s.shading, s.shadows, s.normals, s.transfer, *s.lights)}
     shown |= {type(s.scattering.phase) for s in scenes.values() if s.scattering is not None}
@@ -54,9 +56,24 @@ def test_the_contact_sheet_shows_every_effect_once(embedded):
     assert any(s.scattering is not None and s.scattering.needs_gradient for s in scenes.values())
 
 
+@pytest.mark.slow
+def test_the_sheet_of_surfaces_shows_every_effect_once(embedded):
+    (of,) = contact_sheet.subjects(8)
+    scenes = {title: scene for group in contact_sheet.SHEETS["surfaces"] for title, scene in group(of).items()}
+    assert len(scenes) == 3 * contact_sheet.COLUMNS
+    parts = [(s.surfaces, s.specular, s.occlusion, s.geometry, s.background, s.shadows, s.shading) for s in scenes.values()]
+    shown = {type(part) for some in parts for part in some}
+    shown |= {type(part) for s in scenes.values() for part in parts_of_clipping(s.clipping)}
+    wanted = "Isosurfaces Specular LocalOcclusion HistogramOcclusion SurfaceOcclusion Mesh DepthImage EnvironmentMap "
+    wanted += "PiecewiseShadows InScattering PhenomenologicalBSDF AnisotropicGGX ClippingPlane"
+    assert {getattr(jvr, name) for name in wanted.split()} <= shown
+    assert any(s.transfer.emission is not None for s in scenes.values())
+    assert {s.surfaces.is_opaque for s in scenes.values() if s.surfaces is not None} == {True, False}
+
+
 def test_subjects_of_the_contact_sheet_look_as_their_configurations(embedded):
     (of,) = contact_sheet.subjects(8)
-    given = build_scene(read_config(contact_sheet.CONFIGS / "lit.toml"))
+    given = build_scene(read_config(contact_subjects.CONFIGS / "lit.toml"))
     old, new = (scene.volume.sample for scene in (given, of.scene))
     x = jnp.asarray([[3.0, 10.0, -5.0], [-20.0, 1.0, 12.0]])
     at = lambda scene, sample: jax.vmap(lambda x: sample(scene.volume.grid_from_world((x[0], x[1], x[2]))))(x)
@@ -119,9 +136,10 @@ def test_configurations_of_the_shadowed_fit_describe_the_same_experiment(name, r
     assert job.held_out is not None
 
 
+@pytest.mark.parametrize("of", contact_sheet.SHEETS)
 @pytest.mark.slow
-def test_the_contact_sheet_runs(embedded, monkeypatch, tmp_path):
-    result, size = ran(contact_sheet, monkeypatch, tmp_path)
+def test_the_contact_sheet_runs(of, embedded, monkeypatch, tmp_path):
+    result, size = ran(contact_sheet, monkeypatch, tmp_path, "--of", of)
     assert size > 10_000
     assert all(np.isfinite(row["largest"]) and row["mean"] > 0.005 for row in result["pictures"])
 
@@ -154,6 +172,21 @@ def test_relighting_runs(monkeypatch, tmp_path):
     assert exact["determined"] == 12
     assert exact["coefficients"] < without["coefficients"]
     assert all(exact[key]["psnr"] > without[key]["psnr"] for key in ("held_out", "relit"))
+
+
+@pytest.mark.slow
+def test_rates_of_the_first_hit_run(monkeypatch, tmp_path):
+    result, size = ran(first_hit_rates, monkeypatch, tmp_path)
+    assert size > 10_000
+    rows = {row["choice"]: row for row in result["rows"]}
+    # What is met is met to the tolerance, float32 included, at any rate; what is missed depends on it.
+    assert all(row["error_largest"] < 1.5e-4 for row in rows.values())
+    coarse, fine = rows["one rate, every 2 voxels"], rows["one rate, every 0.25 voxels"]
+    assert coarse["missed"] > 0.005
+    sure, guaranteed = rows["two rates, every 2 and 0.25 voxels, band 1"], rows["guaranteed, every 1 voxels"]
+    assert sure["missed"] == fine["missed"]
+    assert guaranteed["missed"] == 0
+    assert coarse["samples"] < guaranteed["samples"] < fine["samples"]
 
 
 @pytest.mark.slow
