@@ -11,7 +11,7 @@ test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-all: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -m "" -n auto --dist loadfile
+	$(BIN)/python -m pytest -m "" -n auto --dist loadfile --no-loadscope-reorder
 
 # So many damaged files of each format.
 FUZZ ?= 100000

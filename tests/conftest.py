@@ -1,5 +1,6 @@
 """Shapes and types that the annotations of `jvr` claim are checked at run time in every test."""
 
+import collections
 import gc
 import os
 from importlib import metadata
@@ -30,6 +31,12 @@ if "JVR_TEST_DEVICES" in os.environ:
     jax.config.update("jax_num_cpu_devices", int(os.environ["JVR_TEST_DEVICES"]))
 
 DATA = Path(os.environ.get("JVR_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def pytest_collection_modifyitems(items):
+    """Files with the most slow tests come first: processes that share files are done at the same time when the last ones are short."""
+    slow = collections.Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 @pytest.fixture(scope="module", autouse=True)
