@@ -1,7 +1,7 @@
 """Every effect of light on one sheet, and on another isosurfaces, what is around and in a volume, and occlusion: on a CT of a head
 (`ct_head_quarter`, looked for in `$JVR_DATA`) and on the embedded volume.
 
-`python experiments/contact_sheet.py [--of light|surfaces] [-o FILE] [--json FILE] [--quick]`; `--figure` is another name of `-o`. Both
+`python experiments/contact_sheet.py [--of surfaces] [-o FILE] [--json FILE] [--quick]`; `--figure` is another name of `-o`. Both
 scenes come from configurations (`configs/real/ct_head_lit.toml`, `configs/lit.toml`), and each picture changes the one thing that its title
 names; JSON holds its mean and largest radiance and, for shadows, the error against shadow rays.
 """
