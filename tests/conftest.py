@@ -39,6 +39,12 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: -slow[item.path])
 
 
+def pytest_collection_finish():
+    """What imports have made stays, and need not be looked at for garbage."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _programs_go():
     """Compiled programs are let go after each file: a process may hold 65,530 maps of memory, and each program takes several."""
