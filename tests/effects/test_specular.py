@@ -207,7 +207,7 @@ def test_derivatives_match_differences(x64, opacity):
     on both sides of the difference."""
     surfaces = jvr.Isosurfaces([0.6, 1.7], [[0.9, 0.4, 0.2], [0.2, 0.5, 0.9]], opacity, tolerance=1e-6, most=1)
     transfer = jvr.LinearTransfer([-1, 3], [[0.3, 0.8, 0.2], [0.9, 0.3, 0.5]], [0.02, 0.1])
-    specular = jvr.Specular([0.6, 0.8], order=2) if opacity is None else jvr.Specular(index=[1.3, 1.2], order=2)
+    specular = jvr.Specular([0.6, 0.8], order=1) if opacity is None else jvr.Specular(index=[1.3, 1.2], order=2)
     volume = jvr.Volume(smooth(), interpolation=jvr.Tricubic())
     scene = jvr.Scene(volume, transfer, background=sky(), surfaces=surfaces, specular=specular)
     camera = jvr.PerspectiveCamera.look_at([20, -9, 12], [3.5, 4, 3.5], [0, 0, 1], 24, 6, 6)
