@@ -204,10 +204,10 @@ def main() -> None:
     parser.add_argument("-o", "--figure", metavar="FILE", help="PNG of the sheet")
     parser.add_argument("--of", choices=SHEETS, default="light", help="which sheet")
     parser.add_argument("--json", metavar="FILE")
-    parser.add_argument("--quick", action="store_true", help="tiny pictures, every fourth")
+    parser.add_argument("--quick", action="store_true", help="tiny pictures, one column")
     arguments = parser.parse_args()
     size = 24 if arguments.quick else 160
-    found = pictures(subjects(size), SHEETS[arguments.of], every=4 if arguments.quick else 1)
+    found = pictures(subjects(size), SHEETS[arguments.of], every=COLUMNS if arguments.quick else 1)
     if arguments.json:
         Path(arguments.json).write_text(
             json.dumps({"machine": machine(), "size": size, "pictures": rows(found)}, indent=2) + "\n"
