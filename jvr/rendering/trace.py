@@ -73,10 +73,9 @@ def enter(
     where they enter.
 
     They end at opaque geometry, and where what is behind differs from ray to ray, they know what they see there, or of geometry that is
-    lit its colour (`jvr.rendering.geometry.lit_where_rays_end`). `pixels`: of each, `None`
-    where they are of none (`jvr.model.geometry.AbstractGeometry.hit`); `limits`: distances from their origins between which anything is
-    seen. A ray with non-finite numbers gets the length NaN, which
-    `composite` turns into a NaN pixel.
+    lit its colour (`jvr.rendering.geometry.lit_where_rays_end`). `pixels`: of each, `None` where they are of none
+    (`jvr.model.geometry.AbstractGeometry.hit`); `limits`: distances from their origins between which anything is seen. A ray with
+    non-finite numbers gets the length NaN, which `composite` turns into a NaN pixel.
     """
     start = scene.volume.grid_from_world(origin)
     along = scene.volume.grid_from_world(direction, direction=True)
