@@ -270,7 +270,7 @@ def parameters():
     }
 
 
-LIGHTS = {
+BUILT = {
     "sun": lambda p: jvr.DirectionalLight(**p["sun"]),
     "lamp": lambda p: jvr.PointLight(**p["lamp"]),
     "torch": lambda p: jvr.SpotLight(**p["torch"], inner=30.0, outer=120.0, radius=0.7),
@@ -283,7 +283,7 @@ def loss(p, shadows, adjoint, names):
     scene = jvr.Scene(
         volume,
         p["transfer"],
-        lights=tuple(LIGHTS[name](p) for name in names),
+        lights=tuple(BUILT[name](p) for name in names),
         shading=jvr.Lambert(0.0, 0.4, threshold=p["threshold"]),
         shadows=shadows,
         scattering=jvr.SingleScattering(jvr.HenyeyGreenstein(p["g"]), p["albedo"]),
@@ -335,7 +335,7 @@ def test_derivatives_in_every_mode(case, x64):
     """Along a random direction in each kind of array (transfer function, voxels, lights, pose, camera, phase function, albedo): the
     gradient by replay, forward mode, forward mode through the rule of replay, and central differences."""
     names, shadows = CASES[case], SHADOWS[case.split(",")[0]]
-    unused = set(LIGHTS) - set(names)
+    unused = set(BUILT) - set(names)
     p = {name: x for name, x in parameters().items() if name not in unused}
     value = lambda adjoint: lambda p: loss(p, shadows, adjoint, names)
     leaves, moves = directions(p)

@@ -6,6 +6,7 @@ import re
 import struct
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -103,9 +104,14 @@ def _merl() -> Seed:
     from jvr.io import merl
 
     # A whole table has 35 MB: damage does not need so many cells.
-    merl.CELLS = (3, 2, 4)
-    content = struct.pack("<3i", *merl.CELLS) + np.linspace(0, 900, 72).astype("<f8").tobytes()
-    return Seed({"a.binary": content}, "a.binary", merl.read_merl, (merl.MerlError,))
+    few = (3, 2, 4)
+
+    def read(path: Path) -> Any:
+        with mock.patch.object(merl, "CELLS", few):
+            return merl.read_merl(path)
+
+    content = struct.pack("<3i", *few) + np.linspace(0, 900, 72).astype("<f8").tobytes()
+    return Seed({"a.binary": content}, "a.binary", read, (merl.MerlError,))
 
 
 def _checkpoint(folder: Path) -> Seed:
