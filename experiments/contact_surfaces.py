@@ -75,7 +75,7 @@ def occlusion(of: Subject) -> dict[str, jvr.Scene]:
         "local occlusion": change(ambient, occlusion=jvr.LocalOcclusion(**near)),
         "histogram occlusion": change(ambient, occlusion=jvr.HistogramOcclusion(bins=32, clusters=4096, **near)),
         "surface, no occlusion": bone,
-        "surface occlusion": change(bone, occlusion=jvr.SurfaceOcclusion(factor=1.5)),
+        "surface occlusion": change(bone, occlusion=jvr.SurfaceOcclusion()),
         "in-scattering": change(of.scene, shadows=jvr.InScattering(bias=0.1, **near)),
     }
 

@@ -13,6 +13,7 @@ from benchmarks import accelerator, scenes
 from benchmarks.peers.compiled import compiler
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transfer", [scenes.translucent(), scenes.opaque()], ids=["translucent", "opaque"])
 def test_the_march_by_hand_is_that_of_jvr(transfer):
     """On the host, where every machine can run it: the same samples, but for those of jvr that a skip ends with in an empty brick. (A

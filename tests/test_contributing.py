@@ -221,6 +221,7 @@ def test_the_integrator_finds_the_largest_scalar(added):
 BRIGHTNESS = jvr.LinearTransfer([0.0, 0.6, 1.3], [[0.1, 0, 0], [0.4, 0.7, 0.2], [1, 0.8, 0.9]], [0, 0.5, 1])
 
 
+@pytest.mark.slow
 def test_the_integrator_is_differentiable_and_explained(added, x64):
     settings = jvr.Settings(sampling=added.MaximumProjection(12))
     loss = lambda v: jnp.sum(jvr.render(jvr.Scene(jvr.Volume(v), BRIGHTNESS), camera(), settings).rgb ** 2)
@@ -231,6 +232,7 @@ def test_the_integrator_is_differentiable_and_explained(added, x64):
     assert "the largest of 12 scalars of each ray" in str(jvr.plan(jvr.Scene(volume(), BRIGHTNESS), settings))
 
 
+@pytest.mark.slow
 def test_a_fit_goes_along_the_integrators_rays(added):
     """Colours of a table are recovered from projections, which a march with them does not look like."""
     settings, truth = jvr.Settings(sampling=added.MaximumProjection(12)), jvr.Scene(volume(), BRIGHTNESS)

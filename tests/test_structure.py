@@ -193,6 +193,7 @@ def test_a_star_import_brings_every_public_name():
     assert output.strip() == "[] True"
 
 
+@pytest.mark.slow
 def test_new_arrays_of_the_same_structure_are_not_traced_again():
     traces = []
 

@@ -41,8 +41,8 @@ class SurfaceOcclusion(AbstractOcclusion):
       is tiled.
     - `steps`: samples of a ray; `factor`: `D` in voxels of the smallest spacing. Rays reach `steps` times as far; what is thinner than `D`
       may be missed.
-    - `tilt`: what of the normal is added to each direction, which lifts rays off the surface: 0.1 has the lowest at 5.7 degrees, and the
-      mean cosine at 0.563 in place of 0.5. 0 is the whole hemisphere.
+    - `tilt`: what of the normal is added to each direction, which lifts rays off the surface: 0.1, as in the listing, has the lowest at
+      5.7 degrees, and the mean cosine at 0.563 in place of 0.5. 0 is the whole hemisphere.
     - `cosine`: whether directions count by the cosine of their angle, as light on a matt surface does, and not alike.
     - `softness`: how far beyond the isovalue a scalar is that takes all, in data units: `b(d)` rises in a straight line, and `O` has a
       derivative. `None`: a step, which has none.
@@ -61,11 +61,11 @@ class SurfaceOcclusion(AbstractOcclusion):
 
     def __init__(
         self,
-        rays: int = 32,
-        steps: int = 10,
+        rays: int = 48,
+        steps: int = 20,
         *,
-        factor: ArrayLike = 3.0,
-        tilt: ArrayLike = 0.1,
+        factor: ArrayLike = 1.5,
+        tilt: ArrayLike = 0.0,
         cosine: bool = False,
         softness: ArrayLike | None = None,
     ):

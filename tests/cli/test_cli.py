@@ -88,6 +88,7 @@ def snapshot(folder):
     return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "hint"),
     [
@@ -189,6 +190,7 @@ def test_several_cameras_give_numbered_pictures(tmp_path):
     assert read_image("a_00.png").shape == (6, 6, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flags", ["", "--preset ct_bone", "--preset CT-Muscle"])
 def test_a_volume_file_renders_directly(flags, tmp_path):
     assert cli.run(f"render volume.npy -o v.png --size 8 {flags}".split()) == 0
@@ -325,6 +327,7 @@ def test_an_error_of_our_own_is_not_taken_for_bad_input(monkeypatch):
         cli.run(["render", "fit.toml", "-o", "a.png", "--size", "6"])
 
 
+@pytest.mark.slow
 def test_the_installed_command_starts_and_refuses(tmp_path):
     environment = {**os.environ, "JVR_CACHE": "0"}
     command = [sys.executable, "-c", "from jvr.cli import main; main()", "render", "other/no.toml"]
@@ -333,6 +336,7 @@ def test_the_installed_command_starts_and_refuses(tmp_path):
     assert done.stderr == "jvr: other/no.toml: no such file\n"
 
 
+@pytest.mark.slow
 def test_an_installed_wheel_has_the_demo(tmp_path):
     """`jvr demo` needs no repository: the wheel, unpacked elsewhere, finds its configuration in itself."""
     pytest.importorskip("setuptools", reason="builds a wheel without the network")

@@ -125,6 +125,7 @@ def reflected(x, w_o, w_i):
     return jnp.stack(bsdf.reflect(jnp.asarray(0.8), triple(normal), triple(w_o), triple(w_i)))
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences(x64):
     """Also where there is no tangent, and where both roughnesses are the same, at which a fit may begin."""
     w_o, w_i, h = towards(30, 10), towards(40, 200), 1e-6

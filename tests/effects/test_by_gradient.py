@@ -45,6 +45,7 @@ def kinds(coefficient):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["medium", "scattering alone", *(pytest.param(n, marks=pytest.mark.slow) for n in ("surface", "fibres"))]
 )

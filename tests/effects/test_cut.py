@@ -28,6 +28,7 @@ def cut_open(values, shading, normals, x=8.3):
     return np.asarray(render(scene, camera, jvr.Settings(0.5)).rgb[..., 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("normals", [jvr.AnalyticGradient(), jvr.CentralDifferences()], ids=lambda n: type(n).__name__)
 def test_a_cut_face_is_lit_as_the_plane_that_cuts_it(normals):
     """Lambert's cosine of the plane, whatever the noise of the voxels, and Blinn and Phong's highlight beside it."""
@@ -39,6 +40,7 @@ def test_a_cut_face_is_lit_as_the_plane_that_cuts_it(normals):
         np.testing.assert_allclose(cut_open(block(noise), shading, normals), expected, rtol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("normals", [jvr.CentralDifferences(), jvr.SobelDifferences()], ids=lambda n: type(n).__name__)
 def test_rounding_makes_no_surfaces(normals):
     """Inside of equal voxels there is no gradient, and what has none reflects as if it faced the light."""
@@ -49,6 +51,7 @@ def test_rounding_makes_no_surfaces(normals):
     np.testing.assert_allclose(image.rgb[..., 0], 1.0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_cut_through_a_translucent_medium(x64):
     """In the faces of the box and in the light, against central differences; finite in single precision too."""
     values = 0.5 + 0.3 * np.sin(np.arange(6 * 7 * 8)).reshape(6, 7, 8)
@@ -85,6 +88,7 @@ def ball(radius=10.0, size=28):
     return np.where(np.linalg.norm(x - center, axis=-1) <= radius, 2, 0).astype(np.uint8), center
 
 
+@pytest.mark.slow
 def test_a_ball_of_labels_is_lit_as_a_ball():
     """Against Lambert's law of the sphere itself, within nine tenths of its outline."""
     values, center = ball()
@@ -106,6 +110,7 @@ def test_a_ball_of_labels_is_lit_as_a_ball():
     assert expected[seen].std() > 0.2
 
 
+@pytest.mark.slow
 def test_labels_are_shaded_by_what_is_seen(x64):
     """Derivatives in the extinctions of labels, through their normals, by replay against central differences."""
     values = ball(2.6, 7)[0] + (np.arange(7) > 3).astype(np.uint8)

@@ -130,6 +130,7 @@ def test_lights_that_nothing_shows_are_not_in_the_program():
     assert "nothing reflects or scatters it" in lights.reason
 
 
+@pytest.mark.slow
 def test_new_numbers_compile_nothing():
     count = []
 

@@ -51,6 +51,7 @@ def transfer_at(scene):
     )(scene)
 
 
+@pytest.mark.slow
 def test_environment_lights_among_the_lights_add_up():
     """Each has coefficients of its own; together they are their sum, and ask for what shows them."""
     probe, lamp = light(), light(order=2, seed=5)
@@ -66,6 +67,7 @@ def test_environment_lights_among_the_lights_add_up():
 # --- light -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_radiance_of_a_disc_is_that_of_its_projection():
     towards, half_angle = np.array([0.3, -0.5, 0.8]), 35.0
     towards /= np.linalg.norm(towards)
@@ -155,6 +157,7 @@ def test_what_is_reflected_is_the_integral_of_material_and_light(name):
                 np.testing.assert_allclose(value, expected, atol=4e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [0, 3])
 @pytest.mark.parametrize("material", [jvr.LambertBRDF(1.0), jvr.PhaseBRDF(jvr.HenyeyGreenstein(0.7))])
 def test_white_furnace(material, order):
@@ -164,6 +167,7 @@ def test_white_furnace(material, order):
     np.testing.assert_allclose(picture(lit), picture(unlit), atol=2e-5)
 
 
+@pytest.mark.slow
 def test_a_vanishing_gradient_shows_the_mean_of_the_light():
     flat = jvr.Volume(np.full((4, 4, 4), 0.5))
     lit = dataclasses.replace(scene(), volume=flat)
@@ -192,6 +196,7 @@ def test_phase_functions_and_surfaces_do_not_mix_by_value():
         jvr.MaterialByValue([0.0, 1.0], [jvr.LambertBRDF(), MATERIALS["phase"]]).projected(2)
 
 
+@pytest.mark.slow
 def test_ringing_is_cut_off_unless_it_is_asked_for():
     lamp = jvr.EnvironmentLight.disc([0, 0, 1], 3.0, 1e4)
     assert np.min(picture(scene(jvr.PhaseBRDF(jvr.HenyeyGreenstein(0.9)), environment=lamp))) >= 0
@@ -236,6 +241,7 @@ def test_above_an_opaque_half_space(material):
     np.testing.assert_allclose(c[:, 0], expected, atol=0.05)
 
 
+@pytest.mark.slow
 def test_transfer_is_a_plain_sum_over_rays():
     """A loop over directions and steps, by the equations, in NumPy."""
     transfer = jvr.RadianceTransfer(order=2, rays=7, resolution=1.0, growth=1.3, termination=0.0)
@@ -352,6 +358,7 @@ def test_computed_beforehand_and_in_the_picture_are_the_same(tmp_path):
     np.testing.assert_allclose(picture(jvr.precompute(lit, cache=tmp_path)), picture(lit), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_is_kept_may_be_deleted_at_any_time(tmp_path):
     """One file, all of the folder, or the folder while a result is on its way to it."""
     folder, lit = tmp_path / "kept", scene(transfer=jvr.RadianceTransfer(0, rays=1, resolution=0.1), shape=(4, 4, 4))
@@ -372,6 +379,7 @@ def test_what_is_kept_may_be_deleted_at_any_time(tmp_path):
         assert cached(lit, lambda part: shutil.rmtree(folder, ignore_errors=True)) == [True, False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bleeding", [None, pytest.param(jvr.MaterialBleeding(), marks=pytest.mark.slow)])
 def test_what_was_computed_for_another_scene_is_refused(bleeding):
     """With concrete arrays, and where the scene is an argument of a compiled function."""
@@ -468,6 +476,7 @@ def test_parts_that_do_not_go_together_are_refused(parts):
         jvr.Scene(jvr.Volume(voxels()), linear_transfer(), **({"environment": light(), "material": jvr.LambertBRDF()} | parts))
 
 
+@pytest.mark.slow
 def test_rays_inside_of_an_opaque_medium_do_not_turn_with_roundings():
     """There the transparency is below the precision, and a gradient of it would have any direction."""
     lit = dataclasses.replace(scene(transfer=jvr.RadianceTransfer(rays=8, resolution=1.0)), transfer=linear_transfer(scale=1e2))
@@ -552,6 +561,7 @@ def test_memory_counts_every_channel():
         picture(dataclasses.replace(low(transfer), transfer=coloured))
 
 
+@pytest.mark.slow
 def test_nothing_to_scatter_may_be_kept_unscattered():
     lit = scene(transfer=jvr.RadianceTransfer(rays=16), shape=(7, 9, 8))
     assert jvr.precompute(lit, keep_unscattered=True).radiance_transfer.is_final

@@ -122,6 +122,7 @@ def compared(name, which, n, size, transfer):
     return np.sum(found[wanted]) / np.sum(exact[wanted]), np.std(ratio) / np.mean(ratio)
 
 
+@pytest.mark.slow
 def test_shares_of_the_light_against_brute_force():
     """Of 40 lights. The mean; and no blotches: what is left is a twentieth, mostly of the shadow rays' own steps."""
     mean, spread = compared("ball", "both", 20, 16, jvr.RadianceTransfer(rays=16))
@@ -156,6 +157,7 @@ def test_the_shadow_that_a_surface_casts_on_itself(tau, strength):
     np.testing.assert_allclose(found, [2 * e[3], 3 * e[4], 4 * (3 * e[5] - e[3])], atol=0.02)
 
 
+@pytest.mark.slow
 def test_a_shadow_of_what_is_densest_is_dark():
     """Without an overflow, in value and derivative."""
 

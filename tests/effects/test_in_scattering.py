@@ -56,6 +56,7 @@ def solid(sigma):
 RAYS = {"direct": jvr.ShadowRays(termination=0.0), "resolution": 1.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [1e-3, 0.2, 0.6])
 def test_deep_in_a_homogeneous_medium_it_has_the_closed_form(sigma, x64):
     """`exp(-sigma z) / 2 integral_-1^1 exp(-sigma mu a) phi1(sigma (1 + mu) (R - a)) dmu` at the depth `z` below a face that light falls
@@ -150,6 +151,7 @@ def small(**numbers):
     return scene(shadows, jvr.Volume(voxels((6, 5, 4))), linear_transfer())
 
 
+@pytest.mark.slow
 def test_what_is_computed_beforehand_is_kept(tmp_path):
     """And knows what it was computed of: lights among it, `bias` not."""
     one, done = small(), []
@@ -186,6 +188,7 @@ def test_what_cannot_be_is_refused():
         jvr.InScattering(bias=1.5)
 
 
+@pytest.mark.slow
 def test_the_configuration_says_what_it_draws():
     """At four pixels a side and a few nodes: softer shadows than those without."""
     few = ["shadows.rays=4", "shadows.samples=2", "shadows.resolution=0.1", "settings.step=8"]
@@ -199,6 +202,7 @@ def test_the_configuration_says_what_it_draws():
     assert np.max(np.abs(scattered - direct)) > 0.02
 
 
+@pytest.mark.slow
 def test_empty_places_around_lie_in_the_shadow_of_what_is_far():
     """A sheet above throws its shadow on the sheet below, and on the empty space that the ball of that one reaches into."""
     values = np.zeros((9, 9, 41))
@@ -214,6 +218,7 @@ def test_empty_places_around_lie_in_the_shadow_of_what_is_far():
     assert dark < 0.01 < bright
 
 
+@pytest.mark.slow
 def test_surfaces_in_empty_places_lie_in_the_shadow_of_what_is_far():
     """An isosurface where the medium is invisible, a way behind a sheet that takes all light."""
     values = np.zeros((9, 9, 41))

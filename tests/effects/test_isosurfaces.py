@@ -50,6 +50,7 @@ def picture(scene, camera=None, settings=SETTINGS):
     return render(scene, from_above(scene.volume) if camera is None else camera, settings)
 
 
+@pytest.mark.slow
 def test_a_surface_ends_rays_and_shows_its_colour():
     """Its distance is the depth, and it lies in front of the background and behind what of the medium is in front of it."""
     sigma_t, red = 0.3, (0.9, 0.1, 0.2)
@@ -89,6 +90,7 @@ def closed(opacity, values, sigma_t):
     return rgb, 1 - np.mean(T[0] * T[1] * T[2] * np.ones(3)) * (1 - a0) * (1 - a1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_t", [0.15, pytest.param((0.05, 0.2, 0.6), marks=pytest.mark.slow)], ids=["grey", "coloured"])
 def test_translucent_layers_are_blended_at_their_place(sigma_t):
     """`L <- L1 + T1 (a c + (1 - a) L2)`, with opacities 0 and 1 as its ends, and where they are 1e-4 voxels apart."""

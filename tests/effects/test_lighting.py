@@ -65,6 +65,7 @@ def one(scene, settings=FINE, camera=None):
 MIDPOINT = 2e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("g", [None, 0.6, -0.4, 0.99])
 def test_slab_scatters_as_its_integral_says(g, x64):
     phase = jvr.Isotropic() if g is None else jvr.HenyeyGreenstein(g)
@@ -97,6 +98,7 @@ def test_error_of_a_lit_slab_falls_with_the_square_of_the_step(quadrature, x64):
     assert abs(order - 2) < 0.1, errors
 
 
+@pytest.mark.slow
 def test_light_from_the_side(x64):
     """The way of the light is the same for every point of the ray."""
     volume = slab(size=6.0)
@@ -107,6 +109,7 @@ def test_light_from_the_side(x64):
     np.testing.assert_allclose(one(scene), expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_coloured_extinction_colours_the_shadow(x64):
     sigma = np.array([0.05, 0.3, 0.9])
     for direction in DIRECTIONS.values():
@@ -117,6 +120,7 @@ def test_coloured_extinction_colours_the_shadow(x64):
         np.testing.assert_allclose(one(scene), expected, rtol=10 * MIDPOINT)
 
 
+@pytest.mark.slow
 def test_a_clipping_box_lets_light_in(x64):
     """What is cut away shades nothing, along the view and to the side."""
     for direction in (DIRECTIONS["front"], DIRECTIONS["oblique, behind"]):
@@ -142,6 +146,7 @@ def test_a_clipping_box_lets_light_in(x64):
     np.testing.assert_allclose(one(scene), math.exp(-SIGMA * 1.5) * -math.expm1(-SIGMA * LENGTH) / (4 * math.pi), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_ambient_light(x64):
     """From everywhere, unshaded: the medium scatters `albedo L`, surfaces reflect `ambient L`."""
     lights = (jvr.AmbientLight([0.5, 1.0, 2.0]),)
@@ -214,6 +219,7 @@ def tilted(degrees):
     return jvr.DirectionalLight([-math.cos(a), 0.6 * math.sin(a), 0.8 * math.sin(a)])
 
 
+@pytest.mark.slow
 def test_lambert_facing_a_light_returns_the_colour(x64):
     np.testing.assert_allclose(reflected(jvr.Lambert(), tilted(0)), COLOUR, rtol=1e-12)
     np.testing.assert_allclose(reflected(jvr.Lambert(), tilted(60)), 0.5 * COLOUR, rtol=1e-12)
@@ -246,6 +252,7 @@ def test_highlight(kind, x64):
         assert not reflected(shading, tilted(100)).any()
 
 
+@pytest.mark.slow
 def test_no_gradient_reflects_as_if_facing(x64):
     """Wherever the light comes from, without a highlight, with any threshold."""
     for threshold in (0.0, 0.1):
@@ -282,6 +289,7 @@ def test_switch_between_surface_and_medium(x64):
     np.testing.assert_allclose(found, 0.8 * p, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_materials_by_scalar(x64):
     """A `ByValue` is what a number would be where the scalar is such."""
     by_value = lambda low, high: jvr.ByValue([0.0, 1.0], [low, high])
@@ -300,6 +308,7 @@ def test_materials_by_scalar(x64):
         np.testing.assert_allclose(one(many), expected * -math.expm1(-0.2 * LENGTH), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_shadow_of_a_cube_on_a_plane(x64):
     """A thin screen, z < 2, under an opaque cube, x and y in 4 ... 8, z in 6 ... 9; light from above at 45 degrees; seen from below.
 
@@ -370,6 +379,7 @@ def test_soft_shadows_converge_as_samples_do(x64):
     assert max(abs(np.mean(many)), abs(np.mean(across))) < 4 * 0.5 / math.sqrt(400)
 
 
+@pytest.mark.slow
 def test_samples_of_area_lights():
     """Positions are uniform on the ball and on the disc, and intensities add up."""
     position, key = np.array([1.0, 2.0, 3.0]), jax.random.key(3)
@@ -434,6 +444,7 @@ def test_turning_everything_and_the_unit_of_length_change_nothing(x64):
     np.testing.assert_allclose(small.rgb, expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_world_that_is_mirrored_with_its_grid(x64):
     """The same world described by a grid whose first axis runs the other way."""
     settings = jvr.Settings(0.5, termination=0)
@@ -446,6 +457,7 @@ def test_world_that_is_mirrored_with_its_grid(x64):
     np.testing.assert_allclose(render(scene, perspective(volume), settings).rgb, expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("normals", [jvr.AnalyticGradient(of_opacity=True), jvr.CentralDifferences()])
 def test_pre_integrated_segments_know_every_kind_of_normal(normals):
     """Traced alone: the types of what shaders hand on are checked then."""
@@ -511,6 +523,7 @@ def test_what_cannot_be_right_is_refused(make, message):
         make()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sigma", "least"), [(0.5, 0.989), (1.0, 0.962), (4.0, 0.778), (1e4, 0.734)])
 def test_opaque_segments_are_lit_where_their_emission_comes_from(sigma, least):
     """A slab lit and seen from the front, `(1 - exp(-2 tau)) / (8 pi)` per irradiance, by segments of optical depth `sigma`: light at
@@ -543,6 +556,7 @@ class FractionalShadows(AbstractShadows):
         return Fractions()
 
 
+@pytest.mark.slow
 def test_each_light_has_a_slot_of_visibility():
     """What arrives of a light dims that light alone, wherever ambient light stands among others: pictures are linear in lights."""
 

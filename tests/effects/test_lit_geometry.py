@@ -54,6 +54,7 @@ def behind(scene, camera):
 seen_behind = jax.jit(behind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("z", [1.2, -2.0])
 def test_a_square_in_or_below_fog_is_lit_through_it(x64, z):
     """On the way of the light, and on that to the eye."""
@@ -77,6 +78,7 @@ def floor_and_block(height):
     return jvr.Mesh(jnp.concatenate([floor.vertices, block.vertices]), faces, (0.5, 0.5, 0.5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shadows", [jvr.ShadowRays(), pytest.param(jvr.ShadowVolume(), marks=pytest.mark.slow)])
 def test_the_umbra_of_a_block_lies_on_the_floor(shadows):
     """At its exact place, whatever finds the shadows of the medium."""

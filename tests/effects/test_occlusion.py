@@ -109,6 +109,7 @@ def test_a_homogeneous_ball_has_the_closed_form(sigma):
     assert factors(homogeneous(sigma, histograms))[3, 3, 3, 0] == pytest.approx(phi1(2.5 * sigma), abs=5e-4)
 
 
+@pytest.mark.slow
 def test_what_glows_lights_what_is_near():
     """`(1 + c_E) phi1(sigma (R - a))` with `c_E` the `glow` times the emission, in each colour; and its derivative in the emission."""
     one, emission = homogeneous(0.5, local(3.0, 0.5, glow=2.0)), np.array([0.0, 0.1, 3.0])
@@ -143,6 +144,7 @@ def test_a_ball_larger_than_the_volume_sees_all_of_it():
     assert found[3, 3, 3, 0] == pytest.approx(np.mean(np.exp(-0.3 * length)), abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the occlusion was computed for another")
 def test_ambient_light_alone_is_multiplied():
     """With `(bias + (1 - bias) I)^gamma`."""
@@ -223,6 +225,7 @@ def along_rays(one: jvr.Scene, occlusion, node) -> tuple[np.ndarray, np.ndarray]
     return scalars.reshape(shape), inside.reshape(shape)
 
 
+@pytest.mark.slow
 def test_histograms_are_those_of_brute_force():
     """With as many clusters as rays nothing is lost: hats around the scalars of each bin, in each shell of each ray. What a transfer
     function makes of them is marched through the shells."""
@@ -248,6 +251,7 @@ def test_histograms_are_those_of_brute_force():
     assert factors(kept)[node][0] == pytest.approx(left, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_a_new_transfer_function_changes_no_histogram():
     """What is invisible takes nothing; what is homogeneous sends on its own colour."""
     one = scene(jvr.HistogramOcclusion(4, 8, bleeding=0.5, **FEW | {"radius": 4.0}))
@@ -261,6 +265,7 @@ def test_a_new_transfer_function_changes_no_histogram():
     np.testing.assert_array_equal(factors(like(0.0)), 1.0)
 
 
+@pytest.mark.slow
 def test_histograms_know_what_stands_in_front_of_what():
     """A wall and, far behind it, another: the second takes next to nothing of what the first has left."""
     values = np.zeros((13, 13, 13), np.float32)
@@ -409,6 +414,7 @@ def test_forward_mode_agrees_with_reverse_mode(x64):
 # --- What is kept ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["local", pytest.param("histogram", marks=pytest.mark.slow)])
 def test_what_is_computed_beforehand_is_kept(method, tmp_path):
     """And knows what it was computed of; camera and lights may change."""
@@ -501,6 +507,7 @@ def test_what_does_not_go_together_says_what_would(parts, message):
         scene(**({"occlusion": jvr.LocalOcclusion()} | parts))
 
 
+@pytest.mark.slow
 def test_the_configuration_says_what_it_draws():
     """At four pixels a side and a few nodes."""
     few = ["occlusion.rays=4", "occlusion.samples=2", "occlusion.resolution=0.1", "settings.step=8"]

@@ -112,6 +112,7 @@ def slab(**given):
     return seen
 
 
+@pytest.mark.slow
 def test_pictures_show_the_notes_to_the_letter():
     seen = slab(k_d=0.4, k_s=0.3, k_t=0.2, s=5.0, q=3.0, normalised=False)
     for polar in (0.0, 40.0):

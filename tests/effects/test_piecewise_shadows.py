@@ -65,6 +65,7 @@ def brute_force(one: jvr.Scene, light, p, steps=1500) -> np.ndarray:
     return np.exp(-np.sum(sigma.reshape(u.shape), axis=1) * length / steps)
 
 
+@pytest.mark.slow
 def test_a_homogeneous_medium_is_exact():
     """Whatever the piece and the distance of nodes, for oblique light and lamps inside and outside, each with its own shadow."""
     volume = jvr.Volume(np.ones((6, 5, 7)), OBLIQUE)
@@ -93,6 +94,7 @@ def waves(n=25) -> np.ndarray:
 RAMP = jvr.LinearTransfer([0.0, 1.0], np.zeros((2, 3)), [0.0, 0.2])
 
 
+@pytest.mark.slow
 def test_the_error_falls_with_the_square_of_the_distance_between_nodes(x64):
     """Of the sun and of a lamp."""
     lights = (sun(), jvr.PointLight((40.0, 30.0, 50.0)))
@@ -104,6 +106,7 @@ def test_the_error_falls_with_the_square_of_the_distance_between_nodes(x64):
     assert np.all(order > 1.5), (errors, order)
 
 
+@pytest.mark.slow
 def test_near_shadows_are_sharper_than_those_of_a_shadow_volume_of_as_many_nodes(x64):
     """Under the edge of an opaque sheet, two voxels below it."""
     values = np.zeros((24, 24, 24))

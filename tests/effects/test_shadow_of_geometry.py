@@ -29,6 +29,7 @@ def square(height, half):
 SUN, LAMP = jvr.DirectionalLight([0.0, 0.0, -1.0], 3.0), jvr.PointLight([10.0, 10.0, 30.0], 3e3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("light", "shadows", "blur"),
     [

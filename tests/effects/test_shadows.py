@@ -97,6 +97,7 @@ def test_defaults_are_within_a_hundredth(shadows, x64):
         assert error(name, shadows) < 0.01, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shadows",
     [
@@ -196,6 +197,7 @@ def test_deep_map_keeps_its_error_and_reports_where_it_cannot(x64):
     assert picture([light], None).stats.shadows is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shadows", [jvr.ShadowRays(0.7), pytest.param(jvr.ShadowVolume(1.0), marks=pytest.mark.slow)])
 def test_skipping_changes_nothing(shadows):
     """Bricks that are empty are skipped by the eye's rays and by the light's."""
@@ -213,6 +215,7 @@ def test_skipping_changes_nothing(shadows):
         np.testing.assert_allclose(on.rgb, off.rgb, rtol=2e-5, atol=2e-6 * np.asarray(off.rgb).max())
 
 
+@pytest.mark.slow
 def test_termination_of_shadow_rays_bounds_their_error():
     dense = jvr.LinearTransfer([0.0, 1.0], np.zeros((2, 3)), [[0, 0, 0], [4.0, 6.0, 3.0]])
     light = lights(cloud())["directional"]
@@ -330,6 +333,7 @@ def along_each(p, moves, value, h=1e-6):
     return slopes[1], (values[2] - values[0]) / (2 * h)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["none", *(pytest.param(name, marks=pytest.mark.slow) for name in CASES if name != "none")])
 def test_derivatives_in_every_mode(case, x64):
     """Along a random direction in each kind of array (transfer function, voxels, lights, pose, camera, phase function, albedo): the

@@ -52,6 +52,7 @@ def fresnel(degrees, n):
     return np.where(np.sin(i) > n, 1.0, (s**2 + p**2) / 2)
 
 
+@pytest.mark.slow
 def test_a_plane_mirror_shows_the_sky_in_the_mirrored_direction():
     """In front of its own colour and behind what of the medium is in front of it, there and back again."""
     grey = (0.3, 0.3, 0.3)
@@ -71,6 +72,7 @@ def picture_at(scene, degrees, **choices):
     return render(scene, tilted(scene.volume, degrees, **choices), SETTINGS)
 
 
+@pytest.mark.slow
 def test_without_an_order_nothing_of_it_is_in_the_program():
     """But for its numbers, which nothing reads."""
     scene = planes([2.75], [[0.9, 0.1, 0.2]])

@@ -64,6 +64,7 @@ def test_beside_a_wall_it_is_a_half_and_more():
     np.testing.assert_allclose(wall(distance), (1 + np.minimum(distance / 10, 1)) / 2, atol=0.01)
 
 
+@pytest.mark.slow
 def test_inside_of_a_ball():
     """`1 - min(1, R / (2 rho))`, its square where cosines count; tilted rays are those that leave the ball later."""
     assert ball() == pytest.approx(0.5, abs=0.01)

@@ -87,6 +87,7 @@ def test_the_medium_lies_in_the_shadow_of_what_a_sheet_holds_back():
     np.testing.assert_allclose(jvr.render(uncast, camera, SETTINGS).rgb[0, 0, 0], below + 0.6 * above, rtol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "choices", [{}, {"band": 2.0, "coarse": 2}, {"guaranteed": True}], ids=["one rate", "two rates", "guaranteed"]
 )

@@ -49,6 +49,7 @@ def under_a_sky(surfaces=True):
     return far_away(surfaces, environment=sky, material=jvr.LambertBRDF(), radiance_transfer=transfer)
 
 
+@pytest.mark.slow
 def test_nodes_near_surfaces_are_worth_it_where_no_medium_is_visible():
     for make in (occluded, under_a_sky):
         for surfaces in (True, False):
@@ -129,6 +130,7 @@ def test_a_matte_surface_under_a_sky_of_one_colour_shows_its_own():
 # --- Other voxels ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choices", [{}, {"guaranteed": True}], ids=["one rate", "guaranteed"])
 def test_hits_of_splines_are_those_of_scipy(choices, x64):
     """Distances to the tricubic B-spline of random voxels, within the tolerance of roots that SciPy finds; derivatives by its slope."""

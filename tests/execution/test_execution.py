@@ -28,6 +28,7 @@ def scene_of(seed, dtype=np.uint8, shape=(9, 7, 8)):
     return jvr.Scene(jvr.Volume(values, slope=1 / 255), lut_transfer(), background=(0.2, 0.1, 0.3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height", "tile"), [(16, 13, 40), (5, 2, 1), pytest.param(1, 1, 1, marks=pytest.mark.slow)])
 def test_tiles_make_the_picture_of_one_piece(width, height, tile):
     """Numbers of blocks that tiles do not divide, and tiles of less than a block."""
@@ -88,6 +89,7 @@ def test_what_does_not_fit_at_all_and_other_failures_are_raised(message, warns, 
     assert len([w for w in recwarn if "out of memory" in str(w.message)]) == warns
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("adjoint", "lit"),
     [
@@ -119,6 +121,7 @@ def test_a_derivative_outside_of_jit_is_that_of_one_program(x64, adjoint, lit):
     assert names == []
 
 
+@pytest.mark.slow
 def test_one_compilation_while_only_arrays_change():
     camera = perspective(jvr.Volume(np.zeros((9, 7, 8))), 12, 9)
     jvr.render(scene_of(0), camera)
@@ -140,6 +143,7 @@ def test_cores_are_asked_for_too_late(monkeypatch):
         jvr.use_all_cores()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
 def test_rays_over_three_devices(which):
     """The cases of `devices.py`, in a process whose processor is three devices."""

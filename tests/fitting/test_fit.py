@@ -67,6 +67,7 @@ def test_kept_samples_change_nothing_and_report_their_bytes():
     np.testing.assert_array_equal(resampled.scene.transfer.sigma_t, limited.scene.transfer.sigma_t)
 
 
+@pytest.mark.slow
 def test_kept_samples_are_the_samples():
     problem, observations = _problem(), observe(START, CAMERAS, IMAGES, None, SETTINGS)
     samples, kept = keep_samples(START, observations, SETTINGS, 2**30, clamped=True)
@@ -82,6 +83,7 @@ def _problem(loss=None, exposure=None, unknowns=both) -> Problem:
     return Problem(model, chosen, SETTINGS, loss or jvr.SquaredError(), (), None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "loss"),
     [
@@ -143,6 +145,7 @@ def test_colours_and_exposure_together_are_reported_as_undetermined():
     assert np.all(np.isinf(result.standard_errors[1]))
 
 
+@pytest.mark.slow
 def test_robust_losses_ignore_outliers():
     rng = np.random.default_rng(1)
     spoiled = [np.where(rng.random(image.shape) < 0.05, 1.0, image).astype(np.float32) for image in IMAGES]
@@ -258,6 +261,7 @@ def test_nearly_parallel_columns_are_told_apart_down_to_the_rounding_of_float32(
         assert np.all(np.isinf(known.standard_errors[3:]))
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_a_dense_float64_computation():
     """Also of an entry whose colour changes the image a thousandth as much as others do; those beyond the volume are infinite."""
     weak, beyond = 2, 6

@@ -338,6 +338,7 @@ def test_names_that_cameras_have_not_are_refused(unknowns, problem):
         fit(unknowns=unknowns)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_found_is_refused():
     away = jvr.PerspectiveCamera.look_at((30, 0, 0), (60, 0, 0), (0, 0, 1), 30.0, 16, 15)
     with pytest.raises(ValueError, match=r"camera 1 is unknown and sees nothing of the volume.*look_at its centre"):

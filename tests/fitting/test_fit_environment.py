@@ -147,6 +147,7 @@ def test_rows_refuse_light_that_changes_on_its_way(volume, unknown):
         jax.eval_shape(jax.jacfwd(image), select(one))
 
 
+@pytest.mark.slow
 def test_least_squares_of_what_scatters_around_nodes_are_not_differentiated_by_rows(frozen):
     """A dipole changes light on its way as the environment does, also where the radiance transfer itself is kept."""
     scattering = lambda s: s.radiance_transfer.scattering

@@ -56,6 +56,7 @@ def test_asymmetry_albedo_and_direction(volume):
     assert np.linalg.norm(result.scene.lights[0].direction) == pytest.approx(1, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_channel_of_light_acts_on_its_own_channel_of_a_picture_alone(volume):
     """As lights declare it, whatever becomes of their light: a fit then moves the three at once."""
     lights = (

@@ -105,6 +105,7 @@ def fit(start, truth, unknowns, **keywords):
     return jvr.fit(start, cameras, images, unknowns=unknowns, settings=SETTINGS, progress=False, **keywords)
 
 
+@pytest.mark.slow
 def test_kept_samples_reach_beyond_the_first_ends_of_a_table_that_moves():
     """Scalars beyond the ends look alike to a table, so that kept samples may end there; but not where the ends are to be found."""
     truth = jvr.Scene(volume(), table())
@@ -144,6 +145,7 @@ def test_derivatives_are_those_of_reverse_mode():
     np.testing.assert_allclose(2 * np.asarray(normal.vector), gradient, rtol=2e-3, atol=2e-5 * np.abs(gradient).max())
 
 
+@pytest.mark.slow
 def test_a_light_and_a_material_are_found():
     """The length of a heading says nothing: its standard error is not that of an unknown that the images do not determine."""
     truth, unknowns = lit(), lambda s: own(s)[:3]

@@ -71,6 +71,7 @@ def close(found: jvr.Rendering, expected: jvr.Rendering, name: str):
         np.testing.assert_allclose(getattr(found, part), getattr(expected, part), rtol=0, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bricked", "graded", pytest.param("packed", marks=pytest.mark.slow)])
 def test_pictures_after_a_replacement_are_those_of_a_scene_made_anew(kind):
     """With concrete arrays, and where the scene is an argument of a compiled function."""
@@ -97,6 +98,7 @@ def check_pictures(kind, chosen):
         close(as_argument(scene_of(kind, volume), camera), expected, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bricked", "packed", pytest.param("graded", marks=pytest.mark.slow)])
 def test_pictures_where_voxels_are_the_only_argument(kind):
     """All else is closed over, what was kept of other voxels as well."""
@@ -107,6 +109,7 @@ def test_pictures_where_voxels_are_the_only_argument(kind):
     close(jax.jit(of_voxels)(after.values), as_argument(scene_of(kind, anew), camera), kind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["compiled", pytest.param("concrete", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["bricked", "graded"])
 def test_gradients_in_voxels_know_what_is_kept_of_them(kind, way):
@@ -128,6 +131,7 @@ def test_gradients_in_voxels_know_what_is_kept_of_them(kind, way):
         assert np.abs(anew).max() > 0
 
 
+@pytest.mark.slow
 def test_forward_derivatives_know_what_is_kept_of_the_voxels():
     camera = perspective(plain("graded"), 5, 4)
     change = jnp.asarray(np.random.default_rng(0).normal(size=(10, 9, 11)), jnp.float32)

@@ -176,6 +176,7 @@ def test_a_fit_ends_where_scipys_bounded_least_squares_does():
         assert np.max(cosines * np.sqrt(np.minimum(room / wanted, 1.0))) < 1.5 * 1e-3**0.5
 
 
+@pytest.mark.slow
 def test_saturated_colours_and_vanishing_extinctions_come_back():
     rng = np.random.default_rng(2)
     truth, images = _pictures(jvr.LutTransfer(rng.uniform(0.2, 0.8, (6, 3)), rng.uniform(0.05, 0.3, 6), (0.0, 1.0)))

@@ -63,6 +63,7 @@ def test_standard_errors_of_structured_residuals_are_those_of_a_dense_sandwich()
     assert np.median(known / of_noise) > 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_is_not_structured(seed):
     rng = np.random.default_rng(seed)
@@ -150,6 +151,7 @@ def test_values_stay_where_the_objective_grows_more_than_its_model():
     assert not free.any()
 
 
+@pytest.mark.slow
 def test_what_no_picture_shows_is_continued_by_a_fit():
     """The table reaches beyond the volume: its last entries, and their pictures."""
     wide = eqx.tree_at(lambda s: s.transfer.domain, TRUTH, jnp.array([0.0, 1.5]))

@@ -59,6 +59,7 @@ def test_gains_and_errors_are_those_of_dense_rows(known):
         np.testing.assert_allclose(candidate.errors["transfer.sigma_t"], errors[rgb.size :], rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_view_from_afar_brings_little_and_one_of_nothing_is_named(known):
     away = jvr.PerspectiveCamera.look_at((0, 0, 300), (0, 300, 300), (0, 0, 1), 20.0, 9, 9)
     small = jvr.PerspectiveCamera.look_at((0, 0, 300), VOLUME.center, (0, 1, 0), 20.0, 9, 9)
@@ -69,6 +70,7 @@ def test_a_view_from_afar_brings_little_and_one_of_nothing_is_named(known):
     assert 0 < last.gain < first.gain
 
 
+@pytest.mark.slow
 def test_views_from_all_around_are_compared_by_default(known):
     """As far away as the camera of the fit, with its lens."""
     ranked = jvr.next_view(known)
@@ -127,6 +129,7 @@ def test_the_best_view_makes_a_fit_surer_than_the_worst():
     assert sure == sorted(sure)
 
 
+@pytest.mark.slow
 def test_exposure_counts_among_the_unknowns():
     result = fit(TRUTH, exposure=True, max_steps=0)
     (best, *_) = jvr.next_view(result, CANDIDATES, SETTINGS)

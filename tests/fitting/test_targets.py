@@ -103,6 +103,7 @@ def test_images_that_say_nothing_are_refused(change, behind, message):
         targets_of(CAMERAS, IMAGES, [np.zeros((15, 16))] * 3, behind)
 
 
+@pytest.mark.slow
 def test_a_fit_takes_holes_alphas_and_sizes_together():
     wide = jvr.PerspectiveCamera(CAMERAS[2].world_from_camera, 30.0, 9, 8)
     cameras = (*CAMERAS[:2], wide)

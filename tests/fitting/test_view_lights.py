@@ -126,6 +126,7 @@ def test_solvers_of_others_see_all_views(solver):
     np.testing.assert_allclose(found.scene.transfer.rgb, SCENE.transfer.rgb, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_lights_that_do_not_go_together_are_refused():
     images = [np.zeros((8, 9, 3))] * 3
     for lights, error, wanted in (

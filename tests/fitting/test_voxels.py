@@ -56,6 +56,7 @@ def steepness(values, matrix):
     return found
 
 
+@pytest.mark.slow
 def test_priors_are_what_their_equations_say():
     values = np.random.default_rng(0).random((4, 3, 5))
     scene, steep = scene_of(values), steepness(values, OBLIQUE)
@@ -89,6 +90,7 @@ def test_units_and_resolution_do_not_change_what_a_strength_means(shape):
         np.testing.assert_allclose(jvr.TotalVariation(1.0).value(scene), wanted, rtol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prior", [jvr.TotalVariation(1.0, epsilon=0.1), jvr.Tikhonov(1.0, 0.1)], ids=["variation", "tikhonov"])
 def test_priors_are_convex_and_smooth_where_nothing_changes(prior):
     random = np.random.default_rng(1).random((3, 3, 2))
@@ -400,6 +402,7 @@ def desk(tmp_path, monkeypatch):
     Path("voxels.toml").write_text(CONFIG)
 
 
+@pytest.mark.slow
 def test_a_configuration_says_priors_start_range_and_grids(desk):
     job = build_fit(read_config("voxels.toml"))
     assert job.levels == 2

@@ -12,6 +12,7 @@ def names(tmp_path_factory):
     return list(all_seeds(tmp_path_factory.mktemp("seeds")))
 
 
+@pytest.mark.slow
 def test_damaged_files_are_read_or_refused_in_one_line(names):
     found = findings(names, COUNT)
     assert len(found) >= 95
@@ -23,6 +24,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(names):
 KINDS = ("signal", "exception", "time", "terminal", "memory", "no more than announced")
 
 
+@pytest.mark.slow
 def test_the_fuzzer_sees_signals_exceptions_time_and_memory():
     found = findings([f"faulty: {kind}" for kind in KINDS], 0)
     (signal,), (exception,), (time,), (terminal,), (memory,), none = (outcome.faults for outcome in found.values())

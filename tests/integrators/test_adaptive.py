@@ -63,6 +63,7 @@ def random_like(tree, seed=1):
 # -- in the image plane
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(5, 3), *(pytest.param(size, marks=pytest.mark.slow) for size in ((1, 1), (2, 17)))])
 def test_no_tolerance_traces_every_ray(size):
     s = scene()
@@ -296,6 +297,7 @@ def test_a_pyramid_that_is_sampled_everywhere_is_the_full_picture(full):
     assert 0 <= int(picture.stats.sampling.samples[0]) - int(full.stats.samples) <= WIDTH * HEIGHT
 
 
+@pytest.mark.slow
 def test_the_full_picture_converges_to_the_march(full):
     """Slices lie elsewhere along each ray than its own segments, which matters as much as the step does."""
     s = scene()

@@ -124,6 +124,7 @@ def brightness(albedo, sigma_t, fraction):
     return albedo * STRENGTH * COLOUR * (1 - np.exp(-sigma_t * fraction * SIDE))
 
 
+@pytest.mark.slow
 def test_its_picture_is_right_eagerly_and_in_ones_own_program():
     for way in (jvr.render, render):
         picture = way(slab(0.6, 0.4), straight(), jvr.Settings(0.3, termination=0, sampling=Front(0.25)))
@@ -164,6 +165,7 @@ def test_a_fit_goes_along_its_rays(solver):
     np.testing.assert_allclose(jnp.mean(sigma_t), truth[1], rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_what_has_no_derivative_says_so_in_a_line():
     target = np.zeros((2, 2, 3))
     refused = {

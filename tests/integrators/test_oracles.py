@@ -132,6 +132,7 @@ def counted(wanted, last):
 ALL = np.full((HEIGHT, WIDTH), int(np.ceil(12 / STEP)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [0.0, 1.9, 2.1, 3.9, 4.1])
 def test_samples_are_those_that_an_oracle_asks_for(picture, d):
     """Pixels are farther apart than slices: they are the unit."""

@@ -377,6 +377,7 @@ def test_names_become_objects():
     assert len(job.targets) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "hint"), [("transfer.sigma", "did you mean 'transfer.sigma_t'?"), ("light", "known:")])
 def test_an_unknown_that_is_none_is_refused(name, hint):
     with pytest.raises(ConfigError, match=r"fit\.unknowns") as caught:
@@ -384,6 +385,7 @@ def test_an_unknown_that_is_none_is_refused(name, hint):
     assert hint in str(caught.value)
 
 
+@pytest.mark.slow
 def test_held_out_views_are_new_views():
     text = BASE + "[truth]\nkind='window'\n[camera]\nkind='fibonacci'\ncount=4\nwidth=6\nheight=6\n"
     job = build_fit(config(text + "[fit]\nheld_out=3\n"))

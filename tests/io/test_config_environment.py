@@ -258,6 +258,7 @@ def asked_for(unknowns, *sets):
     return scene.radiance_transfer is not None, keywords["keep_material"], keywords["keep_unscattered"], found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("unknowns", "keep_material", "keep_unscattered", "keeps_radiance_transfer"),
     [
@@ -299,6 +300,7 @@ def test_a_fit_of_the_light_starts_from_another_environment(sky):
     assert same(found.scene.material, jax.jit(lambda m: m.projected(3))(jvr.LambertBRDF(0.5)))
 
 
+@pytest.mark.slow
 def test_a_white_furnace_is_white():
     """A matte white medium that hides its surroundings, under light of one from everywhere."""
     made = build_scene(config(ENVIRONMENT, "transfer={kind='linear',positions=[-1,2],rgb=[[1,1,1],[1,1,1]],sigma_t=[9,9]}"))

@@ -200,6 +200,7 @@ def test_a_volume_keeps_its_gradients_where_they_are_used_and_the_voxels_are_kno
     assert scene_of(LIT + truth, "normals=precomputed", "fit.unknowns=['volume.values']").volume.gradients is None
 
 
+@pytest.mark.slow
 def test_a_scene_without_light_is_as_before_and_loads_no_effects():
     code = (
         "import sys; from jvr.io.config import build_scene, config_from; "
@@ -338,6 +339,7 @@ def test_parts_that_do_not_go_together_are_refused(text, key, hint):
     assert hint in line
 
 
+@pytest.mark.slow
 def test_unknowns_of_light_are_named_by_their_paths():
     text = FIT + "[fit]\nunknowns = ['scattering.phase.g', 'lights.0.position', 'lights[0].intensity', 'scattering.albedo']\n"
     job = build_fit(config(text, "scattering.phase={kind='henyey-greenstein',g=0.5}"))
@@ -378,6 +380,7 @@ def test_mistakes_about_unknown_light_are_named(change, hint):
     assert hint in refusal(build_fit, FIT + "[fit]\nunknowns = ['scattering.albedo']\n", change)
 
 
+@pytest.mark.slow
 def test_a_lit_configuration_renders():
     scene = scene_of(LIT, "shadows={kind='rays',step=8}", "lights=['head','ambient',{kind='point',position=[0,-90,90]}]")
     camera = jvr.PerspectiveCamera.look_at((0.0, -200.0, 0.0), (0.0, 0.0, 0.0), (0, 0, 1), 30.0, 4, 4)
@@ -392,6 +395,7 @@ EACH = FIT.replace('phase = "isotropic"', 'phase = "isotropic"\n[fit]\nunknowns 
 ENDS = "fit.lights=[{kind='directional',direction=[1,0,0]},[{kind='head'},{kind='ambient',radiance=0.5}]]"
 
 
+@pytest.mark.slow
 def test_each_view_of_a_fit_may_have_lights_of_its_own():
     """The targets are rendered under them; views beyond those of [camera] have the scene's."""
     job = build_fit(config(EACH, ENDS, "fit.held_out=[0]"))

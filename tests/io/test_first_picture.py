@@ -73,6 +73,7 @@ def test_a_preset_that_fits_says_nothing():
     assert what_is_seen(jvr.Volume(ct()), jvr.presets.ct()) is None
 
 
+@pytest.mark.slow
 def test_pictures_are_framed_on_what_is_visible():
     """A small ball in the corner of a large volume fills the picture; the box would leave it a few pixels."""
     values = np.zeros((4 * N,) * 3, np.float32)

@@ -200,6 +200,7 @@ def _frames(pose, **more):
     return json.dumps({"w": 4, "h": 4, "frames": [{"file_path": "a.png", "transform_matrix": pose.tolist()}], **more})
 
 
+@pytest.mark.slow
 def test_a_moved_principal_point_is_a_part_of_a_larger_picture():
     scene, settings = jvr.Scene(jvr.Volume(voxels((9, 8, 7))), linear_transfer()), jvr.Settings(0.5)
     whole = jvr.PerspectiveCamera.look_at((14, -11, 9), (4, 4, 3), (0, 0, 1), 50, 20, 16)
@@ -210,6 +211,7 @@ def test_a_moved_principal_point_is_a_part_of_a_larger_picture():
     np.testing.assert_allclose(jvr.render(scene, part, settings).rgb, expected, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_derivatives_of_focal_lengths_and_principal_point(x64):
     scene, settings = jvr.Scene(jvr.Volume(voxels((6, 5, 5))), linear_transfer()), jvr.Settings(0.5, termination=0)
     pose = jvr.PerspectiveCamera.look_at((12.0, -9.0, 7.0), (2.5, 2, 2), (0, 0, 1), 40, 6, 5).world_from_camera

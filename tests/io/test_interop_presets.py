@@ -303,6 +303,7 @@ def test_what_jvr_says_and_others_do_not_hold_is_named(tmp_path):
         interop.write_slicer(tmp_path / "b.xml", interop.Preset(linear_transfer(rng)))
 
 
+@pytest.mark.slow
 def test_gaussians_are_sampled(tmp_path):
     transfer = jvr.GaussianTransfer([0.5, 1.5], [0.1, 0.3], [2.0, 5.0], [[1, 0, 0], [0, 1, 0]])
     interop.write_paraview(tmp_path / "a.json", interop.Preset(transfer))

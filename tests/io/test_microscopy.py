@@ -293,6 +293,7 @@ def test_both_transformations_units_and_channel_names_of_ome_zarr(tmp_path, zarr
     np.testing.assert_allclose(spacing_of(silent(path, time=1, channel=1, spacing=2, origin=(0, 0, 0))), 2)
 
 
+@pytest.mark.slow
 def test_old_ome_zarr_and_the_layout_of_bioformats2raw(tmp_path):
     path, values = tmp_path / "a.zarr", stack(1, 2, 3, 4, 5)
     for image in ({}, {"axes": list("tczyx")}):

@@ -119,6 +119,7 @@ print(json.dumps(found))
 """
 
 
+@pytest.mark.slow
 def test_arguments_of_another_type_are_named(tmp_path):
     """In a process of its own, where annotations are not checked, as it is for everybody else."""
     RAMP.tofile(tmp_path / "a.raw")
@@ -178,6 +179,7 @@ def test_levels_of_packed_voxels_are_not_taken_for_missing_ones():
     np.testing.assert_array_equal(missing(dataclasses.replace(packed, slope=1.0)), RAMP == 7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("through", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_scenes_and_pictures_can_be_copied_and_pickled(through):
     volume = jvr.Volume(RAMP, missing=3.0)

@@ -98,6 +98,7 @@ def _target(voxels):
     return [o + s * (n - 1) / 2 for o, s, n in zip(ORIGIN, SPACING, voxels.shape, strict=True)]
 
 
+@pytest.mark.slow
 def test_vtk_sees_the_same():
     voxels = _voxels()
     theirs = _vtk_picture(voxels)

@@ -110,6 +110,7 @@ def test_every_parameter_at_once(x64):
     check_every_way(p, tuple(p), rows=(jax.grad,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "rows"),
     [
@@ -123,6 +124,7 @@ def test_transfer_functions(kind, rows, x64):
     check_every_way(parameters(TRANSFERS[kind]()), ("transfer", "intercept"), rows=rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "optical", [jvr.EmissionOnly(), pytest.param(jvr.AbsorptionOnly(), marks=pytest.mark.slow)], ids=["emission", "absorption"]
 )
@@ -138,6 +140,7 @@ def test_pre_integrated_segments(kind, parts, x64):
     check_every_way(parameters(TRANSFERS[kind]()), ("transfer", "voxels", "eye"), rows=(), quadrature=jvr.PreIntegrated(parts))
 
 
+@pytest.mark.slow
 def test_entry_and_exit_through_a_clipping_box(x64):
     p = parameters(TRANSFERS["Gaussians"](), clipped=True, parallel=True)
     check_every_way(p, ("clipping", "eye", "extent"), rows=(), parallel=True)
@@ -152,6 +155,7 @@ def test_tiles_and_no_jit(x64):
     agree(jax.grad(make_loss(fixed, jvr.Replay(), tile=7))(moving), whole, ROUNDING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("transform", "adjoint"),
     [
@@ -188,6 +192,7 @@ def alone():
     return jax.jit(lambda x: jax.lax.map(lambda x: gradient(*x), x))(batch())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "termination"),
     [("linear", 0.2), ("table, coloured", 0.0), pytest.param("linear, coloured", 0.2, marks=pytest.mark.slow)],
@@ -243,6 +248,7 @@ def each(p):
     return jax.tree.map(lambda x: jnp.stack([x, x]), p)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "way",
     [w if w in ("jacfwd", "checkpoint of vmap, shared") else pytest.param(w, marks=pytest.mark.slow) for w in FORWARDS_AND_BACK],

@@ -85,6 +85,7 @@ def found(hits):
     return np.where(hits.found, hits.u, np.inf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choices", [{"step": 0.25}, {"guaranteed": True}], ids=["step", "guaranteed"])
 def test_a_hit_is_the_first_crossing_of_the_interpolant(choices):
     values, rays = waves(), rays_through()
@@ -138,6 +139,7 @@ def test_hits_lie_on_the_triangles_of_marching_cubes():
     assert distance.max() < 0.1
 
 
+@pytest.mark.slow
 def test_a_sheet_thicker_than_a_step_is_never_missed():
     """A layer of voxels of 1 in zeros is at the level `v` a sheet of thickness `2 (1 - v)`."""
     values, rays = np.zeros(SHAPE), rays_through(axes=(2,))
@@ -150,6 +152,7 @@ def test_a_sheet_thicker_than_a_step_is_never_missed():
     assert missed(0.95, step=0.5, guaranteed=True) == 0
 
 
+@pytest.mark.slow
 def test_two_rates_find_the_same_with_fewer_samples():
     """Of distances to a ball, which change by at most one in a voxel: no surface is missed, though no brick is skipped."""
     values = np.linalg.norm(grid() - 2.5, axis=0) - 2
@@ -257,6 +260,7 @@ def test_hard_cases_are_finite():
             assert not any(np.any(x) for x in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_a_hit_in_the_last_half_segment_is_found():
     """The last sample is where the ray leaves, and what is missing hides what is there."""
     values, rays = grid()[2], rays_through(axes=(2,))

@@ -152,6 +152,7 @@ def boundaries(low=6.0):
     return jvr.Scene(jvr.Volume(values), transfer, background=(0.1, 0.2, 0.3))
 
 
+@pytest.mark.slow
 def test_bricks_without_boundaries_are_empty():
     """Of cells of 4^3 voxels those alone are visible in which both values are."""
     scene = boundaries()
@@ -165,6 +166,7 @@ def test_bricks_without_boundaries_are_empty():
     assert np.all(np.asarray(without))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("normals", "most"), [(jvr.AnalyticGradient(), 4.0), pytest.param(SOBEL, 9.0, marks=pytest.mark.slow)])
 def test_pictures_and_gradients_are_the_same_and_take_fewer_samples(normals, most, x64):
     """With respect to voxels and the ends of the opacity; the latter by a replay that skips nothing. Of the 13 samples a ray are left those

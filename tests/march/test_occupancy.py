@@ -51,6 +51,7 @@ def test_the_empty_radius_is_the_largest_known_empty_cube():
 TABLES = st.integers(2, 9).flatmap(lambda n: st.lists(st.sampled_from([0.0, 0.0, 1e-30, 0.05, 3.0]), min_size=n, max_size=n))
 
 
+@pytest.mark.slow
 @given(st.data())
 @settings(max_examples=100, deadline=None)
 def test_a_range_is_visible_where_something_in_it_is(data):
@@ -128,6 +129,7 @@ pictures = jax.jit(
 )
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**31), st.sampled_from([1.0, -2.0]), st.sampled_from([np.uint8, float]))
 @settings(max_examples=25, deadline=None)
 def test_picture_is_the_same(seed, slope, dtype):
@@ -183,6 +185,7 @@ def test_gradient_is_the_same(of, x64):
             assert np.any(on[0].transfer.sigma_t[transfer.sigma_t == 0] != 0)
 
 
+@pytest.mark.slow
 def test_gradient_where_matter_begins_is_the_same(x64):
     """Voxels at the very value where extinction begins to rise: they are empty, and the derivative in them is not zero. (A fit of voxels
     that starts from an empty volume lives on it.) Light that no picture needs is looked up there, too."""
@@ -208,6 +211,7 @@ def test_gradient_where_matter_begins_is_the_same(x64):
     assert np.sum(on[:3] != 0) > 20
 
 
+@pytest.mark.slow
 def test_the_jacobian_is_the_same(x64):
     """Those of extinctions skip nothing; those of colours, alone, what is empty."""
     volume, transfer = scene_of(np.random.default_rng(2), (9, 8, 11), float, 1.0)
@@ -300,6 +304,7 @@ def test_fit_leaves_out_what_is_negligible(x64):
     assert 1e-9 < error <= 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "transfer",
     [

@@ -59,6 +59,7 @@ def close(found, expected):
         assert np.max(np.abs(b)) > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("unknowns", "adjoint", "depth"),
     [
@@ -74,6 +75,7 @@ def test_hessian_vector_products(unknowns, adjoint, depth, x64):
     close(product(start, along), differences(gradient, start, along))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", [jvr.Replay(), jvr.Rows()])
 def test_the_gradient_in_colours_along_extinctions_that_are_zero(adjoint, x64):
     """What a gradient in colours alone skips has a derivative in the extinction."""
@@ -92,6 +94,7 @@ def test_forward_mode_twice(adjoint, x64):
     close(twice(start), differences(jax.jit(slope), start, along))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", [jvr.Replay(), jvr.Rows()])
 def test_reverse_mode_twice_is_refused_with_what_to_use(adjoint):
     loss, start, along = make_loss("table", adjoint, depth=False)

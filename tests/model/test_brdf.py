@@ -146,6 +146,7 @@ def test_roughest_mirrors_have_a_closed_form(x64):
     np.testing.assert_allclose((a + b)[-1], 1 - np.log(2), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_metal_is_tinted_and_its_rim_is_not():
     metal = jvr.MicrofacetBRDF(metallic=1.0, roughness=0.4)
     share = lambda w_o, w_i: [float(part[0]) for part in metal.evaluate(w_o, w_i)]

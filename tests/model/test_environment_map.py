@@ -74,6 +74,7 @@ def test_it_meets_its_projection_and_turns_with_it():
     np.testing.assert_allclose(found.rotated(turn).radiance(d @ turn.T), light.rotated(turn).radiance(d @ turn.T), atol=8e-3)
 
 
+@pytest.mark.slow
 def test_its_derivatives_are_those_of_differences_and_finite_at_the_poles(x64):
     chart, pixels = jvr.EnvironmentMap(noise()), jnp.asarray(noise())
     red = jax.jit(lambda d: chart.radiance(d)[:, 0])
@@ -92,6 +93,7 @@ def test_its_derivatives_are_those_of_differences_and_finite_at_the_poles(x64):
     np.testing.assert_allclose(weights.sum(axis=(1, 2)), [[0, 1, 0]] * 5, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_directions_are_drawn_as_their_density_says():
     """Also where a lamp is 10,000 times brighter than the rest, and rows and pixels are black."""
     plain = noise(8).astype(np.float32)
@@ -134,6 +136,7 @@ def test_a_mean_over_drawn_directions_is_the_integral_over_the_sphere():
     np.testing.assert_allclose(jvr.EnvironmentMap(0 * pixels).pdf(d[:3, 0]), 1 / (4 * np.pi), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_irradiance_is_that_of_harmonics_and_of_quadrature(x64):
     """Of a polynomial in closed form: bands times pi, 2 pi / 3 and pi / 4 (Ramamoorthi and Hanrahan 2001)."""
     bands = np.pi * np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])
@@ -187,6 +190,7 @@ def scene(background, **parts):
     return jvr.Scene(jvr.Volume(voxels(), OBLIQUE), linear_transfer(), background=background, **parts)
 
 
+@pytest.mark.slow
 def test_a_constant_map_is_a_background_of_that_colour():
     colour = [0.2, 0.4, 0.7]
     around = jvr.EnvironmentMap(np.broadcast_to(colour, (4, 8, 3)))
@@ -197,6 +201,7 @@ def test_a_constant_map_is_a_background_of_that_colour():
     np.testing.assert_array_equal(found.depth, wanted.depth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["perspective", *(pytest.param(k, marks=pytest.mark.slow) for k in ("orthographic", "refined"))])
 def test_each_ray_sees_it_in_its_own_direction(x64, kind):
     """Behind what is opaque it is hidden, behind glass attenuated, beside the volume as it is."""
@@ -285,6 +290,7 @@ height = 64
 """
 
 
+@pytest.mark.slow
 def test_configurations_and_files_name_it(tmp_path):
     (tmp_path / "a.toml").write_text(CONFIG)
     found = build_scene(read_config(tmp_path / "a.toml"))

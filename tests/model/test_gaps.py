@@ -34,6 +34,7 @@ QUADRATURES = {"midpoint": jvr.Midpoint(), "pre-integrated": jvr.PreIntegrated()
 DEFAULT = [("NaN", "pre-integrated"), ("packed", "midpoint")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "quadrature"),
     [
@@ -61,6 +62,7 @@ SLOWER = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("normals", [jvr.AnalyticGradient(), *SLOWER])
 def test_there_is_no_shell_around_what_is_missing(normals):
     """The gradient of a ramp is that of the ramp up to the edge of the data: what is left of it is lit alike everywhere."""
@@ -125,6 +127,7 @@ def test_derivatives_are_those_of_differences(adjoint, x64):
     np.testing.assert_allclose(found, wanted, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_every_derivative_is_finite_and_missing_voxels_have_none(x64):
     """In voxels by differences, where one is missing zero; in slope and intercept, too."""
     start = jvr.Scene(jvr.Volume(np.where(np.asarray(smooth().gaps) & 1 > 0, np.nan, np.asarray(smooth().values, float))), TABLE)

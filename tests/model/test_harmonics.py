@@ -214,6 +214,7 @@ def test_bad_input_is_refused(call):
         call()
 
 
+@pytest.mark.slow
 def test_gradients_of_rotation_and_products():
     with jax.enable_x64(True):
         c, e = jnp.asarray(coefficients(3)), jnp.asarray(coefficients(2, 1))

@@ -119,6 +119,7 @@ def test_an_axis_of_one_voxel_has_no_slope(scheme, of_opacity, x64):
     assert not gradients(scheme(of_opacity), jvr.Volume(np.ones((1, 1, 1))), np.zeros((1, 3))).any()
 
 
+@pytest.mark.slow
 def test_precomputed_gradients_are_central_differences_at_voxels(x64):
     volume = jvr.Volume(voxels(), OBLIQUE, slope=1.3, intercept=-0.1)
     p = np.stack(np.meshgrid(*map(np.arange, volume.shape), indexing="ij"), -1).reshape(-1, 3).astype(float)
@@ -142,6 +143,7 @@ def sobel_at_voxels(values):
     return np.stack(found, -1)
 
 
+@pytest.mark.slow
 def test_precomputed_sobel_gradients(x64):
     """At voxels those of SciPy and of `SobelDifferences`, kept or not, along axes of one voxel too; between voxels interpolated."""
     for shape in ((5, 6, 7), (4, 1, 5)):
@@ -274,6 +276,7 @@ DEFAULT = [(jvr.PrecomputedGradient, True)]
 OF_OPACITY = [(jvr.AnalyticGradient, True), (jvr.CentralDifferences, True), (jvr.PrecomputedGradient, True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "of_opacity"),
     [
@@ -294,6 +297,7 @@ def test_gradient_of_a_shaded_picture(scheme, of_opacity, x64):
         np.testing.assert_allclose(a, b, atol=1e-6 * np.abs(b).max(), err_msg=jax.tree_util.keystr(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", [jvr.AnalyticGradient, pytest.param(jvr.SobelDifferences, marks=pytest.mark.slow)])
 def test_a_vanishing_gradient_has_no_normal_and_no_nan(scheme):
     """A constant volume: no surface, so that the picture is that of light that is faced, an unlit one of colours as dark as the material,
@@ -337,6 +341,7 @@ def test_table_of_scalar_and_gradient(x64):
         np.testing.assert_allclose(-np.log1p(-alpha), tau, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_opacity_by_gradient(x64):
     """None at `low` and below, all at `high` and above."""
     inner = jvr.LinearTransfer([0.0, 1.0], np.ones((2, 3)), [0.3, 0.3])
@@ -354,6 +359,7 @@ GRADIENT_TRANSFERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["table", "opacity"])
 def test_skipping_changes_nothing(kind):
     values = voxels((17, 15, 16))
@@ -370,6 +376,7 @@ def test_skipping_changes_nothing(kind):
     np.testing.assert_allclose(on.rgb, off.rgb, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [pytest.param("coloured table", marks=pytest.mark.slow), "opacity"])
 def test_derivatives_of_a_transfer_of_the_gradient(kind, x64):
     """In its table or its limits, and in the voxels, against central differences."""

@@ -46,6 +46,7 @@ def test_other_voxels_are_rounded_to_256_levels(dtype):
     np.testing.assert_allclose([rounded.min(), rounded.max()], [exact.min(), exact.max()], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_packed_pictures_and_gradients_are_the_same():
     scene = scene_of(3)
     packed = eqx.tree_at(lambda s: s.volume, scene, scene.volume.packed())

@@ -137,6 +137,7 @@ def test_float32_keeps_its_digits(make):
         np.testing.assert_allclose(value, true, rtol=3e-6)
 
 
+@pytest.mark.slow
 @BOTH
 def test_attenuated_emission(make, x64):
     """Segments across all of a table of random colours: 2e-4 at optical depth 0.2, and 4e-6 in four parts. At a fifth of that depth one
@@ -149,6 +150,7 @@ def test_attenuated_emission(make, x64):
         assert np.abs(emitted - true).max() < tolerance * true.max()
 
 
+@pytest.mark.slow
 def test_self_attenuation_has_order_four(x64):
     """Optical depth near 1 through entries on smooth curves, coloured."""
     s = np.linspace(0, 1, 33)
@@ -202,6 +204,7 @@ def test_optical_depth_of_a_ray_does_not_depend_on_the_step(segments):
     np.testing.assert_allclose(dtau[:, 0].sum(), sigma.sum() / 63, rtol=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make", [linear_transfer, pytest.param(coloured_table, marks=pytest.mark.slow)], ids=["linear", "coloured table"]
 )
@@ -243,6 +246,7 @@ def test_equal_ends_are_a_segment_of_constant_properties(make):
             np.testing.assert_allclose(value, true, rtol=1e-6)
 
 
+@pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize("factor", [0.0, 1e-30, 1e-6, 10.0, 1e3, 1e6, 1e8])
 def test_extremes_of_extinction(make, factor):
@@ -299,6 +303,7 @@ def test_colours_stay_between_those_of_the_table(opaque):
     assert colour.max() - colour.min() > 0.9
 
 
+@pytest.mark.slow
 def test_thin_entries_beside_opaque_ones_keep_their_digits():
     """A difference of prefix sums would have lost them: eleven orders of magnitude between entries of one table."""
     thin = 1e-5 * (1 + np.arange(40) % 3)
@@ -382,6 +387,7 @@ def test_derivatives_are_those_of_central_differences(make, x64):
         np.testing.assert_allclose((4 * near - far) / 3, slope, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 @BOTH
 def test_forward_mode_is_reverse_mode(make, x64):
     arguments = (make(scale=2.0), *(jnp.asarray(v) for v in smooth_segments()))

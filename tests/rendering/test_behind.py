@@ -39,6 +39,7 @@ def picture(scene, opaque):
     return jvr.render(scene, camera, jvr.Settings(0.3, termination=0, sampling=Walled(opaque)))
 
 
+@pytest.mark.slow
 def test_what_a_ray_ends_at_is_seen_through_the_medium_in_front(x64):
     sigma_t, T = 0.4, np.exp(-0.4 * SIDE / 2)
     found = picture(slab(sigma_t, BACKGROUND), 1.0)

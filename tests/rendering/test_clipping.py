@@ -77,6 +77,7 @@ CUTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", CUTS)
 def test_a_homogeneous_cube_cut_by_planes(cut, x64):
     """Each ray's way inside, by half-spaces in NumPy: `rgb (1 - exp(-sigma d))`."""

@@ -48,6 +48,7 @@ def close(image, rgb, alpha, tolerance):
     np.testing.assert_allclose(image.alpha, np.broadcast_to(alpha, image.alpha.shape), rtol=tolerance)
 
 
+@pytest.mark.slow
 @PRECISIONS
 @pytest.mark.parametrize("thickness", [0.37, 3.0, 0.001])
 def test_homogeneous_slab_whatever_the_step(double, tolerance, thickness):
@@ -60,6 +61,7 @@ def test_homogeneous_slab_whatever_the_step(double, tolerance, thickness):
     assert np.all(abs(np.asarray(image.stats.steps) - steps) <= 1)
 
 
+@pytest.mark.slow
 @PRECISIONS
 def test_homogeneous_box_from_every_side(double, tolerance):
     with precision(double):
@@ -166,6 +168,7 @@ def test_unit_of_length_does_not_matter(scale):
     np.testing.assert_allclose(other.depth / scale, one.depth, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("termination", [1e-2, 0.3])
 def test_error_of_early_termination_is_bounded_by_its_setting(termination):
     volume = jvr.Volume(voxels(), OBLIQUE)

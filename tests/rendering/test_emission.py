@@ -74,6 +74,7 @@ def test_under_each_optical_model_and_with_coloured_extinction(x64):
         seen(pictured(bar(np.full(9, 0.4)), transfer, optical=optical), rgb, alpha)
 
 
+@pytest.mark.slow
 def test_in_front_of_and_behind_what_absorbs(x64):
     """Nearest voxels make sharp slabs: 0 ... 2.5 glows, 2.5 ... 5.5 absorbs, 5.5 ... 8 glows; the eye is beyond 8. A flame in front is as
     bright as by itself, one behind is dimmed."""
@@ -270,6 +271,7 @@ def test_what_glows_is_not_skipped():
     assert 32 - skipped <= image.stats.steps[0, 0] < 32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quadrature", [jvr.Midpoint(), pytest.param(jvr.PreIntegrated(), marks=pytest.mark.slow)])
 def test_light_and_shadows_leave_it_alone(quadrature):
     """Lit black smoke shows what the unlit one shows: its emission, whatever light falls on it."""

@@ -88,6 +88,7 @@ def scaled(factor):
     return jvr.LinearTransfer(transfer.positions, transfer.rgb, np.asarray(transfer.sigma_t) * factor)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1e-30, 1e-20, 1e-6, 1e-3, 1.0, 10.0, 1e2, 1e4, 1e6, 1e8])
 def test_optical_depth(factor):
     """Extinction of a segment, about 0.3 times the factor, and a dozen segments a ray."""
@@ -192,6 +193,7 @@ def test_origin_far_from_the_volume():
     check(scene(scaled(1.0), volume), perspective(volume), kink=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [(2.5, 3.0, 10.0), (2.5, 3.0, 5.0), (5.0, 6.0, 10.0), (2.3, 2.9, 7.7)])
 def test_parallel_rays(place):
     """Rays along x exactly: through voxels, in voxel planes, in faces and along edges of the box, and edge-on beside it."""
@@ -200,6 +202,7 @@ def test_parallel_rays(place):
     check(scene(scaled(2.0), UNIT), camera, kink=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factors", [(1.0, 1.0, 1.0), (1.0, 0.0, 1.0), (1e-6, 1.0, 1e4)])
 def test_coloured_extinction(factors):
     transfer = linear_transfer(coloured=True)
@@ -207,6 +210,7 @@ def test_coloured_extinction(factors):
     check(scene(transfer), perspective(jvr.Volume(voxels(), OBLIQUE)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     {
@@ -248,6 +252,7 @@ def test_derivative_in_a_gaussian_of_height_zero(x64):
     np.testing.assert_allclose(jax.jit(jax.jacrev(emission))(jnp.array([0.0, 0.5, 0.0])), expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [0.4, 4.0, 20.0, 40.0])
 def test_entries_deep_behind_an_opaque_front_keep_their_digits(depth):
     """A ramp of the scalar along the view: each entry of the table lies in a layer of its own, the last behind optical depth
@@ -282,6 +287,7 @@ def scene_gradient(scene, camera):
     return total, {jax.tree_util.keystr(path): x for path, x in jax.tree_util.tree_leaves_with_path(gradient)}
 
 
+@pytest.mark.slow
 def test_a_voxel_that_is_not_a_number_is_seen_by_the_rays_that_meet_it_alone():
     """Those that miss the volume read voxel (0, 0, 0) all the same. The box keeps all others away from it: nothing may change. (Voxels that
     a fit has made so: what is constructed so has gaps instead.)"""
@@ -298,6 +304,7 @@ def test_a_voxel_that_is_not_a_number_is_seen_by_the_rays_that_meet_it_alone():
         np.testing.assert_array_equal(gradient[name], g, err_msg=name)
 
 
+@pytest.mark.slow
 def test_the_largest_number_marks_what_has_no_data():
     """As NaN does, with a warning; under light, with voxels half a world length apart."""
     camera = look([9, 10, 11], [2, 2, 2], fov_y=30.0)
@@ -317,6 +324,7 @@ def test_the_largest_number_marks_what_has_no_data():
         np.testing.assert_array_equal(gradient[name], g, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outer", [1e-10, 1e-4, 0.01, 30.0])
 def test_narrow_spots(outer):
     """Light half-way between axis and edge, against the same numbers in double precision, with derivatives by central differences there."""

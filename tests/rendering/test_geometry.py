@@ -37,6 +37,7 @@ def picture(geometry, settings=STEP, **parts):
     return render(fog(geometry=geometry, **parts), camera(), settings)
 
 
+@pytest.mark.slow
 def test_a_plane_in_fog_is_seen_through_what_is_in_front(x64):
     inside = 1.13
     found = picture(plane(EYE - SIDE + inside))
@@ -52,6 +53,7 @@ def test_a_plane_in_fog_is_seen_through_what_is_in_front(x64):
     assert int(found.stats.steps[0, 0]) == np.ceil(inside / 0.25)
 
 
+@pytest.mark.slow
 def test_what_is_behind_is_a_background_and_what_is_in_front_hides_all(x64):
     far, near = picture(plane(EYE + 5.0)), picture(plane(2.0))
     np.testing.assert_allclose(far.rgb, render(fog(background=GEOMETRY), camera(), STEP).rgb, rtol=1e-12)

@@ -32,6 +32,7 @@ def test_finer_steps_cost_more_samples_and_err_less():
     assert all(m.rmse <= m.largest for m in found)
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_pictures():
     """Against a reference at the same step they are rounding alone; of another picture, its own difference."""
     (same,) = jvr.measure(SCENE, CAMERA, [jvr.Settings(0.5, termination=0.0)], reference_step=0.5, repeats=1)

@@ -34,6 +34,7 @@ def cosines(camera):
     return -np.asarray(d[2], np.float64).reshape(4, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "eye"),
     [("perspective", EYE), *(pytest.param(*c, marks=pytest.mark.slow) for c in (("orthographic", EYE), ("perspective", 900.0)))],

@@ -63,6 +63,7 @@ def with_gradients(arrays, rest):
     return rgb, gradient
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])
 @pytest.mark.parametrize("gradients", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_far_cameras_and_far_worlds_keep_the_digits_of_near_ones(kind, gradients):

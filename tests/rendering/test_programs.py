@@ -51,6 +51,7 @@ def moving(base, camera, what):
     return base.transfer, lambda t: (dataclasses.replace(base, transfer=t), camera)
 
 
+@pytest.mark.slow
 def test_another_step_compiles_nothing():
     """Of a picture that is not part of somebody's program; it is the one of that step."""
     base, camera = scene(), perspective(jvr.Volume(voxels(), None))
@@ -63,6 +64,7 @@ def test_another_step_compiles_nothing():
     np.testing.assert_array_equal(coarse.stats.steps, fresh.stats.steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "what"),
     [
@@ -123,6 +125,7 @@ def code():
     return sum(int(last, 16) - int(first, 16) for first, last in ends)
 
 
+@pytest.mark.slow
 def test_fits_of_one_kind_share_their_programs_and_cleared_ones_are_gone():
     """With other numbers and another function that names the unknowns nothing is compiled."""
     jax.clear_caches()
@@ -159,6 +162,7 @@ def test_measurements_share_their_programs():
     assert not compilations
 
 
+@pytest.mark.slow
 def test_under_vmap_a_sample_on_a_voxel_reads_that_voxel():
     """The ray in the middle has samples in voxels: the index of a voxel and the weights that go with it come from one position, also where
     the compiler computes both in kernels of their own."""

@@ -32,6 +32,7 @@ CAMERAS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", ["pinhole", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("perspective", "orthographic"))]
 )

@@ -73,6 +73,7 @@ def test_a_colour_that_may_be_any_is_undetermined(table):
 # --- Transfer function -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_curves_are_the_arrays(table):
     truth = jvr.LinearTransfer([-900.0, 0.0, 300.0], np.eye(3), [0.0, 1.0, 0.5])
     figure = plot_transfer(table, standard_errors=ERRORS, truth=truth)
@@ -288,6 +289,7 @@ def make_page(tmp_path, result, **keywords):
     return text, Page(text)
 
 
+@pytest.mark.slow
 def test_page_says_what_was_smoothed_and_that_the_model_does_not_explain_the_images(tmp_path, table):
     result = make_result(table, ERRORS)
     plain, _ = make_page(tmp_path, result)
