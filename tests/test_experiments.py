@@ -122,7 +122,7 @@ def test_the_head_and_its_maps_have_their_up_and_front_where_the_world_has_them(
     assert front[0, 0] > front[1, 0] + 0.05
 
 
-@pytest.mark.parametrize("name", ["shadowed_fit.toml", pytest.param("real/shadowed_fit.toml", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["shadowed_fit.toml", "real/shadowed_fit.toml"])
 @pytest.mark.slow
 def test_configurations_of_the_shadowed_fit_describe_the_same_experiment(name, request, monkeypatch):
     if name.startswith("real"):

@@ -49,17 +49,24 @@ def measure(
     reference_step: float | None = None,
     repeats: int = 5,
 ) -> tuple[Measurement, ...]:
-    """Renders a reference (double precision, a quarter of the finest step, every sample to the end of each ray), then the same picture
-    under each of `settings`, taken in turns so that a slow moment of the machine hits all alike.
+    """Renders a reference (double precision, a quarter of the finest step, every sample to the end of each ray, as many rays a pixel as the
+    most of `settings` and by their filter), then the same picture under each of `settings`, taken in turns so that a slow moment of the
+    machine hits all alike.
 
     **Arguments:** `unknowns`: what a gradient is measured for, as in `jvr.fit`: that of half the mean squared radiance;
     `reference_step`: step of the reference, in voxels; `repeats`: pictures timed for each setting.
-    **Returns** one `Measurement` for each of `settings`. Not traceable. **Raises** `ValueError` without settings.
+    **Returns** one `Measurement` for each of `settings`. Not traceable. **Raises** `ValueError` without settings, and for settings of
+    different pixel filters, whose pictures have no reference in common.
     """
     if not settings:
         raise ValueError("measure needs at least one jvr.Settings to compare with the reference")
     step = min(s.step for s in settings) / FINER if reference_step is None else reference_step
-    truth = reference(scene, camera, Settings(step, termination=0.0, skipping=False), unknowns)
+    most = max(s.pixel_samples for s in settings)
+    filters = {s.pixel_filter for s in settings if s.pixel_samples > 1} or {settings[0].pixel_filter}
+    if len(filters) > 1:
+        raise ValueError("settings have different pixel filters, each of which makes another picture: measure those of one at a time")
+    exact = Settings(step, termination=0.0, skipping=False, pixel_samples=most, pixel_filter=filters.pop())
+    truth = reference(scene, camera, exact, unknowns)
     timed = timed_pictures([(scene, one) for one in settings], camera, unknowns, repeats=repeats)
     return tuple(compared(truth, one, picture) for one, picture in zip(settings, timed, strict=True))
 

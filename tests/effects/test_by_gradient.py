@@ -46,9 +46,7 @@ def kinds(coefficient):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["medium", "scattering alone", *(pytest.param(n, marks=pytest.mark.slow) for n in ("surface", "fibres"))]
-)
+@pytest.mark.parametrize("name", ["medium", "scattering alone", "surface", "fibres"])
 def test_it_is_a_number_where_the_gradient_is_one(name, x64):
     pictures = []
     for slope in SLOPES:

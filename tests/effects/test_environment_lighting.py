@@ -380,7 +380,7 @@ def test_what_is_kept_may_be_deleted_at_any_time(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bleeding", [None, pytest.param(jvr.MaterialBleeding(), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("bleeding", [None, jvr.MaterialBleeding()])
 def test_what_was_computed_for_another_scene_is_refused(bleeding):
     """With concrete arrays, and where the scene is an argument of a compiled function."""
     frozen = jvr.precompute(low(jvr.RadianceTransfer(1, rays=4, resolution=0.4, bleeding=bleeding)))

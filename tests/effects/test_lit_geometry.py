@@ -79,7 +79,7 @@ def floor_and_block(height):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shadows", [jvr.ShadowRays(), pytest.param(jvr.ShadowVolume(), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("shadows", [jvr.ShadowRays(), jvr.ShadowVolume()])
 def test_the_umbra_of_a_block_lies_on_the_floor(shadows):
     """At its exact place, whatever finds the shadows of the medium."""
     n, height = 48, 4.0

@@ -415,7 +415,7 @@ def test_forward_mode_agrees_with_reverse_mode(x64):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["local", pytest.param("histogram", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["local", "histogram"])
 def test_what_is_computed_beforehand_is_kept(method, tmp_path):
     """And knows what it was computed of; camera and lights may change."""
     one, done = scene(METHODS[method](rays=6, radius=3.0, samples=3, resolution=0.6)), []

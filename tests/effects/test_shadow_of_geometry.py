@@ -34,16 +34,11 @@ SUN, LAMP = jvr.DirectionalLight([0.0, 0.0, -1.0], 3.0), jvr.PointLight([10.0, 1
     ("light", "shadows", "blur"),
     [
         (SUN, jvr.ShadowRays(), 0.0),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (
-                (LAMP, jvr.ShadowRays(), 0.0),
-                (SUN, jvr.ShadowVolume(1.0), 1.5),
-                (LAMP, jvr.ShadowVolume(1.0), 1.5),
-                (SUN, jvr.DeepShadowMap(64), 1.0),
-                (LAMP, jvr.PiecewiseShadows(), 0.0),
-            )
-        ),
+        (LAMP, jvr.ShadowRays(), 0.0),
+        (SUN, jvr.ShadowVolume(1.0), 1.5),
+        (LAMP, jvr.ShadowVolume(1.0), 1.5),
+        (SUN, jvr.DeepShadowMap(64), 1.0),
+        (LAMP, jvr.PiecewiseShadows(), 0.0),
     ],
 )
 def test_the_umbra_of_a_square_has_its_exact_size(light, shadows, blur):

@@ -98,13 +98,7 @@ def test_defaults_are_within_a_hundredth(shadows, x64):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "shadows",
-    [
-        jvr.ShadowVolume(0.7),
-        *(pytest.param(s, marks=pytest.mark.slow) for s in (jvr.OpacityShadowMap(9, 5), jvr.DeepShadowMap(9, 40, error=1e-6))),
-    ],
-)
+@pytest.mark.parametrize("shadows", [jvr.ShadowVolume(0.7), jvr.OpacityShadowMap(9, 5), jvr.DeepShadowMap(9, 40, error=1e-6)])
 def test_homogeneous_medium(shadows, x64):
     """Whatever the number of nodes, optical depth is linear along a light's ray inside of a box whose sides the light shines along."""
     volume = jvr.Volume(np.ones((6, 5, 7)))
@@ -198,7 +192,7 @@ def test_deep_map_keeps_its_error_and_reports_where_it_cannot(x64):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shadows", [jvr.ShadowRays(0.7), pytest.param(jvr.ShadowVolume(1.0), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("shadows", [jvr.ShadowRays(0.7), jvr.ShadowVolume(1.0)])
 def test_skipping_changes_nothing(shadows):
     """Bricks that are empty are skipped by the eye's rays and by the light's."""
     values = voxels((17, 15, 16))
@@ -317,6 +311,7 @@ CASES = {
     "rays, sun": ("sun",),
     "rays, lamp": ("lamp",),
     "rays, torch": ("torch",),
+    "rays, sun and lamp": ("sun", "lamp"),
     "volume, lamp": ("lamp",),
     "opacity map, torch": ("torch",),
     "deep map, sun": ("sun",),
@@ -334,7 +329,7 @@ def along_each(p, moves, value, h=1e-6):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["none", *(pytest.param(name, marks=pytest.mark.slow) for name in CASES if name != "none")])
+@pytest.mark.parametrize("case", CASES)
 def test_derivatives_in_every_mode(case, x64):
     """Along a random direction in each kind of array (transfer function, voxels, lights, pose, camera, phase function, albedo): the
     gradient by replay, forward mode, forward mode through the rule of replay, and central differences."""

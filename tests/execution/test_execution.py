@@ -29,7 +29,7 @@ def scene_of(seed, dtype=np.uint8, shape=(9, 7, 8)):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("width", "height", "tile"), [(16, 13, 40), (5, 2, 1), pytest.param(1, 1, 1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("width", "height", "tile"), [(16, 13, 40), (5, 2, 1), (1, 1, 1)])
 def test_tiles_make_the_picture_of_one_piece(width, height, tile):
     """Numbers of blocks that tiles do not divide, and tiles of less than a block."""
     scene, camera = scene_of(0), perspective(jvr.Volume(np.zeros((9, 7, 8))), width, height)
@@ -90,14 +90,7 @@ def test_what_does_not_fit_at_all_and_other_failures_are_raised(message, warns, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("adjoint", "lit"),
-    [
-        (jvr.Replay(), False),
-        pytest.param(jvr.Replay(), True, marks=pytest.mark.slow),
-        pytest.param(jvr.Rows(), False, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("adjoint", "lit"), [(jvr.Replay(), False), (jvr.Replay(), True), (jvr.Rows(), False)])
 def test_a_derivative_outside_of_jit_is_that_of_one_program(x64, adjoint, lit):
     """In everything that is an array of a picture that tiles do not divide, and compiled once."""
     scene = scene_of(1, np.float64)
@@ -144,7 +137,7 @@ def test_cores_are_asked_for_too_late(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("which", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("which", ["not slow", "slow"])
 def test_rays_over_three_devices(which):
     """The cases of `devices.py`, in a process whose processor is three devices."""
     cases = SCRIPTS / "devices.py"

@@ -85,12 +85,7 @@ def _problem(loss=None, exposure=None, unknowns=both) -> Problem:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("names", "loss"),
-    [
-        ("entries", jvr.SquaredError()),
-        ("everything", jvr.Huber(0.05)),
-        pytest.param("coloured", jvr.AbsoluteError(0.01), marks=pytest.mark.slow),
-    ],
+    ("names", "loss"), [("entries", jvr.SquaredError()), ("everything", jvr.Huber(0.05)), ("coloured", jvr.AbsoluteError(0.01))]
 )
 def test_normal_equations_have_the_gradient_of_the_objective(loss, names, x64):
     scene = jax.tree.map(lambda x: x.astype(float), TRUTH)
@@ -422,7 +417,7 @@ def test_residuals_are_rendered_minus_target():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("of", ["colours", pytest.param("voxels", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("of", ["colours", "voxels"])
 def test_a_fit_skips_what_has_no_derivative(of):
     """Mostly empty at the start: the same iterations with skips and without."""
     values = np.zeros((17, 17, 17), np.float32)

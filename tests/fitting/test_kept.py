@@ -72,7 +72,7 @@ def close(found: jvr.Rendering, expected: jvr.Rendering, name: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["bricked", "graded", pytest.param("packed", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["bricked", "graded", "packed"])
 def test_pictures_after_a_replacement_are_those_of_a_scene_made_anew(kind):
     """With concrete arrays, and where the scene is an argument of a compiled function."""
     check_pictures(kind, lambda name: "another" not in name)
@@ -99,7 +99,7 @@ def check_pictures(kind, chosen):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["bricked", "packed", pytest.param("graded", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["bricked", "packed", "graded"])
 def test_pictures_where_voxels_are_the_only_argument(kind):
     """All else is closed over, what was kept of other voxels as well."""
     before, after = keep(kind, plain(kind)), plain(kind, 1)
@@ -110,7 +110,7 @@ def test_pictures_where_voxels_are_the_only_argument(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("way", ["compiled", pytest.param("concrete", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("way", ["compiled", "concrete"])
 @pytest.mark.parametrize("kind", ["bricked", "graded"])
 def test_gradients_in_voxels_know_what_is_kept_of_them(kind, way):
     """The same with what is kept and without, at the voxels that it was made of and at others; by both modes."""

@@ -365,6 +365,16 @@ def test_a_fit_of_light_starts_where_it_is_told_to():
     np.testing.assert_array_equal(told.targets[0], untold.targets[0])
 
 
+def test_a_fit_of_a_surface_starts_where_it_is_told_to():
+    surface = "[surfaces]\nvalues = [0.5]\nrgb = [[1, 1, 1]]\n"
+    text = FIT + surface + "[fit]\nunknowns = ['surfaces.values']\n"
+    told, untold = build_fit(config(text + "[fit.initial]\nsurfaces.values = [0.4]\n")), build_fit(config(text))
+    np.testing.assert_array_equal(told.scene.surfaces.values, np.float32([0.4]))
+    np.testing.assert_array_equal(untold.scene.surfaces.values, [0.5])
+    # The targets show the truth.
+    np.testing.assert_array_equal(told.targets[0], untold.targets[0])
+
+
 @pytest.mark.parametrize(
     ("change", "hint"),
     [

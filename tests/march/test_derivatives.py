@@ -113,21 +113,14 @@ def test_every_parameter_at_once(x64):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "rows"),
-    [
-        pytest.param("linear, coloured", (jax.grad,), marks=pytest.mark.slow),
-        ("table", ()),
-        ("Gaussians", ()),
-        pytest.param("Gaussians, coloured", (jax.jacfwd, jax.grad), marks=pytest.mark.slow),
-    ],
+    [("linear, coloured", (jax.grad,)), ("table", ()), ("Gaussians", ()), ("Gaussians, coloured", (jax.jacfwd, jax.grad))],
 )
 def test_transfer_functions(kind, rows, x64):
     check_every_way(parameters(TRANSFERS[kind]()), ("transfer", "intercept"), rows=rows)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "optical", [jvr.EmissionOnly(), pytest.param(jvr.AbsorptionOnly(), marks=pytest.mark.slow)], ids=["emission", "absorption"]
-)
+@pytest.mark.parametrize("optical", [jvr.EmissionOnly(), jvr.AbsorptionOnly()], ids=["emission", "absorption"])
 def test_optical_models(optical, x64):
     p = parameters(TRANSFERS["table, coloured"]())
     names = ("transfer", "eye") if isinstance(optical, jvr.EmissionOnly) else ("voxels", "eye")
@@ -158,12 +151,7 @@ def test_tiles_and_no_jit(x64):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("transform", "adjoint"),
-    [
-        (jax.grad, jvr.Replay()),
-        (jax.jacfwd, jvr.Forward()),
-        pytest.param(jax.grad, jvr.Rows(), marks=pytest.mark.slow),
-        pytest.param(jax.jacfwd, jvr.Rows(), marks=pytest.mark.slow),
-    ],
+    [(jax.grad, jvr.Replay()), (jax.jacfwd, jvr.Forward()), (jax.grad, jvr.Rows()), (jax.jacfwd, jvr.Rows())],
     ids=["replay", "forward", "rows, reverse", "rows, forward"],
 )
 def test_vmapped(transform, adjoint, x64):
@@ -193,10 +181,7 @@ def alone():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "termination"),
-    [("linear", 0.2), ("table, coloured", 0.0), pytest.param("linear, coloured", 0.2, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize(("kind", "termination"), [("linear", 0.2), ("table, coloured", 0.0), ("linear, coloured", 0.2)])
 def test_rows_of_a_table(kind, termination, x64):
     """Without distances, rows of a table come out of one replay with hat functions."""
     p = parameters(TRANSFERS[kind]())
@@ -249,10 +234,7 @@ def each(p):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "way",
-    [w if w in ("jacfwd", "checkpoint of vmap, shared") else pytest.param(w, marks=pytest.mark.slow) for w in FORWARDS_AND_BACK],
-)
+@pytest.mark.parametrize("way", FORWARDS_AND_BACK)
 def test_one_rule_for_both_modes(way, x64):
     loss, moving, gradient = of_several()
     if way == "jacfwd":

@@ -167,7 +167,7 @@ def test_bricks_without_boundaries_are_empty():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("normals", "most"), [(jvr.AnalyticGradient(), 4.0), pytest.param(SOBEL, 9.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("normals", "most"), [(jvr.AnalyticGradient(), 4.0), (SOBEL, 9.0)])
 def test_pictures_and_gradients_are_the_same_and_take_fewer_samples(normals, most, x64):
     """With respect to voxels and the ends of the opacity; the latter by a replay that skips nothing. Of the 13 samples a ray are left those
     around the surface, and with Sobel's differences those from where a voxel next to it is read."""

@@ -61,12 +61,7 @@ def close(found, expected):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("unknowns", "adjoint", "depth"),
-    [
-        ("voxels", jvr.Replay(), True),
-        pytest.param("table", jvr.Rows(), False, marks=pytest.mark.slow),
-        pytest.param("table", jvr.Rows(), True, marks=pytest.mark.slow),
-    ],
+    ("unknowns", "adjoint", "depth"), [("voxels", jvr.Replay(), True), ("table", jvr.Rows(), False), ("table", jvr.Rows(), True)]
 )
 def test_hessian_vector_products(unknowns, adjoint, depth, x64):
     loss, start, along = make_loss(unknowns, adjoint, depth)

@@ -298,7 +298,7 @@ def test_gradient_of_a_shaded_picture(scheme, of_opacity, x64):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", [jvr.AnalyticGradient, pytest.param(jvr.SobelDifferences, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scheme", [jvr.AnalyticGradient, jvr.SobelDifferences])
 def test_a_vanishing_gradient_has_no_normal_and_no_nan(scheme):
     """A constant volume: no surface, so that the picture is that of light that is faced, an unlit one of colours as dark as the material,
     with derivatives in both modes."""
@@ -377,7 +377,7 @@ def test_skipping_changes_nothing(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [pytest.param("coloured table", marks=pytest.mark.slow), "opacity"])
+@pytest.mark.parametrize("kind", ["coloured table", "opacity"])
 def test_derivatives_of_a_transfer_of_the_gradient(kind, x64):
     """In its table or its limits, and in the voxels, against central differences."""
     p = {"values": jnp.asarray(voxels((3, 4, 5))), "transfer": GRADIENT_TRANSFERS[kind]()}

@@ -205,9 +205,7 @@ def test_optical_depth_of_a_ray_does_not_depend_on_the_step(segments):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "make", [linear_transfer, pytest.param(coloured_table, marks=pytest.mark.slow)], ids=["linear", "coloured table"]
-)
+@pytest.mark.parametrize("make", [linear_transfer, coloured_table], ids=["linear", "coloured table"])
 def test_close_ends_keep_every_digit_in_value_and_gradient(make):
     """Ends that are equal, or apart by 1e-7 ... 1: at entries, across them, beside them and outside, in both directions."""
     table = make()

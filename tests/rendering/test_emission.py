@@ -272,7 +272,7 @@ def test_what_glows_is_not_skipped():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("quadrature", [jvr.Midpoint(), pytest.param(jvr.PreIntegrated(), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("quadrature", [jvr.Midpoint(), jvr.PreIntegrated()])
 def test_light_and_shadows_leave_it_alone(quadrature):
     """Lit black smoke shows what the unlit one shows: its emission, whatever light falls on it."""
     settings = jvr.Settings(0.5, termination=0, quadrature=quadrature)

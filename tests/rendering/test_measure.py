@@ -48,3 +48,16 @@ def test_errors_are_those_of_the_pictures():
 def test_needs_settings():
     with pytest.raises(ValueError, match="at least one"):
         jvr.measure(SCENE, CAMERA, [])
+
+
+@pytest.mark.slow
+def test_the_reference_has_the_rays_of_the_finest_pixels():
+    """More rays a pixel are nearer to it, and one of them is not what it is: an edge within a pixel is its mean."""
+    one, two, three = jvr.measure(SCENE, CAMERA, [jvr.Settings(1.0, pixel_samples=n) for n in (1, 2, 3)], repeats=1)
+    assert three.rmse < two.rmse < one.rmse
+
+
+def test_settings_of_two_filters_have_no_reference():
+    settings = [jvr.Settings(1.0, pixel_samples=2), jvr.Settings(1.0, pixel_samples=2, pixel_filter=jvr.TentFilter())]
+    with pytest.raises(ValueError, match="measure those of one at a time"):
+        jvr.measure(SCENE, CAMERA, settings)

@@ -70,20 +70,15 @@ def test_another_step_compiles_nothing():
     [
         ("shadow volume", "transfer"),
         ("forward, clipped", "camera"),
-        *(
-            pytest.param(*c, marks=pytest.mark.slow)
-            for c in (
-                ("plain", "transfer"),
-                ("rows", "transfer"),
-                ("shadow rays", "transfer"),
-                ("shadow rays", "voxels"),
-                ("shadow rays", "camera"),
-                ("shadow volume", "light"),
-                ("scattering", "light"),
-                ("refinement", "transfer"),
-                ("forward", "voxels"),
-            )
-        ),
+        ("plain", "transfer"),
+        ("rows", "transfer"),
+        ("shadow rays", "transfer"),
+        ("shadow rays", "voxels"),
+        ("shadow rays", "camera"),
+        ("shadow volume", "light"),
+        ("scattering", "light"),
+        ("refinement", "transfer"),
+        ("forward", "voxels"),
     ],
 )
 def test_derivatives_that_are_not_compiled_are_one_program(case, what):

@@ -16,7 +16,10 @@ from jvr.io.config.text import read_toml
 
 Override = tuple[str, Any]
 # Tables whose values may be others where a fit starts.
-INITIAL = ("camera", "lights", "shading", "scattering", "background", "environment", "material", "radiance_transfer", "occlusion")
+INITIAL = (
+    *("camera", "lights", "shading", "scattering", "background", "environment", "material", "radiance_transfer", "occlusion"),
+    *("surfaces", "specular"),
+)
 # Keys of one table that exclude each other.
 ALTERNATIVES = {"path": "builtin", "fov_y": "half_angle_tangent", "opacity": "sigma_t"}
 ALTERNATIVES |= {b: a for a, b in ALTERNATIVES.items()}
@@ -111,7 +114,7 @@ def _with_cameras(data: dict[str, Any], name: str, folder: Path, keys: tuple[str
 def started(config: Config) -> Config:
     """The configuration with the values of `fit.initial` in place of its own.
 
-    **Raises** `ConfigError` for keys that say nothing about cameras and light, and for values that are refused there.
+    **Raises** `ConfigError` for keys that say nothing about cameras, light and surfaces, and for values that are refused there.
     """
     fit = config.tables.fit
     if fit is None or not fit.initial:
