@@ -68,7 +68,7 @@ def study(quick: bool) -> Study:
     volume, name, level, size = (demo_volume(), "embedded volume", 0.45, 48) if head is None else (head, "CT of a head", 0.5, 64)
     if quick:
         volume = jvr.Volume(np.asarray(volume.values)[::3, ::3, ::3], np.diag([3.0, 3.0, 3.6, 1.0]))
-        size = 14
+        size = 28
     values = np.asarray(volume.values, float)
     near = np.abs(values - level) < 0.1
     slope = float(np.median(np.linalg.norm(np.gradient(values), axis=0)[near]))

@@ -21,6 +21,7 @@ from experiments import (
     pose_recovery,
     relight,
     shadowed_fit,
+    surface_fit,
     tomography,
 )
 from jvr.io.config import build_fit, build_scene, read_config
@@ -203,6 +204,22 @@ def test_the_accuracy_of_occlusion_runs(monkeypatch, tmp_path):
             assert rows[method, "rays 8"]["rmse_matter"] > default["rmse_matter"]
         surface = rows["surface", "default"]
         assert surface["rmse_seen"] < 0.5 * surface["without_seen"]
+
+
+@pytest.mark.slow
+def test_the_fit_of_a_surface_runs(monkeypatch, tmp_path):
+    report, size = ran(surface_fit, monkeypatch, tmp_path)
+    assert size > 10_000
+    # Two renderers that share nothing, but for pixels where single and double precision meet different things.
+    assert report["renderers"]["rms_inside"] < 1e-5
+    for row in report["derivatives"].values():
+        # What no ray's derivative knows is at silhouettes, and is nearly all of the difference that there is.
+        assert row["missing_inside"] < 0.1
+        assert row["missing_at_silhouettes"] > 0.5
+        assert row["difference_at_silhouettes"] > 0.9
+    fit = next(row for row in report["fits"] if row["pictures"] == "jvr" and row["silhouettes"])
+    assert abs(fit["isovalue"]) < 3 * fit["isovalue_error"]
+    assert fit["degrees"] < 0.5 * surface_fit.TURN
 
 
 @pytest.mark.slow
