@@ -127,7 +127,7 @@ def scattered(subject: Subject, quick: bool) -> list[dict[str, Any]]:
     truth = numpy_occlusion.in_ball(subject.medium, where, subject.rays // 16, (OFFSET, RADIUS), LIGHT)
     scene, rows = dataclasses.replace(subject.scene, lights=(jvr.DirectionalLight(LIGHT),)), []
     plain = _least(lambda: jvr.render(scene, subject.camera).rgb)
-    knobs = varied(jvr.InScattering, {"rays": (8, 64, 256), "samples": (4, 32), "resolution": (0.25, 1.0)}, quick)
+    knobs = varied(jvr.InScattering, {"rays": (8, 64, 256), "samples": (4, 32), "resolution": (0.5, 0.25)}, quick)
     knobs += [] if quick else [("ShadowRays", jvr.InScattering(direct=jvr.ShadowRays()))]
     for knob, shadows in knobs:
         row, kept = costs(subject, plain, dataclasses.replace(scene, shadows=shadows))

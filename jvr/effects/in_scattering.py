@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 from jvr.effects.grid import Grid
 from jvr.effects.nodes import AbstractProjection, project_all, seen_around, surfaces_of, visible_nodes
+from jvr.effects.occlusion import resolution_for, resolutions
 from jvr.effects.piecewise_shadows import PiecewiseShadows
 from jvr.effects.short_rays import Reach, knobs_of_rays, mean_light, short_rays, sources_of_rays
 from jvr.march.medium import AbstractVisibility, LightPath, Medium
@@ -21,7 +22,7 @@ from jvr.model.clipping import Clipping
 from jvr.model.effects import AbstractPrecomputable, AbstractShadows, stale_message
 from jvr.model.grids import Shape, fractions_at_voxels, node_shape, nodes_for_each_voxel
 from jvr.model.parameters import assign, choice, parameter
-from jvr.model.parts import Knob, multiples
+from jvr.model.parts import Knob
 from jvr.model.ranges import AT_LEAST_ONE, NOT_NEGATIVE, UNIT_INTERVAL, Interval
 from jvr.model.scene import Scene
 from jvr.model.volume import Volume
@@ -57,7 +58,7 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
     **Arguments:**
 
     - `rays`, `radius`, `offset`, `samples`, `resolution`: `K`, `R`, `a`, segments along each ray and nodes for each voxel, as of
-      `jvr.LocalOcclusion`; lengths in the world, by default 16 and 1 times the smallest spacing.
+      `jvr.LocalOcclusion`, and with its defaults.
     - `bias`: 0 ... 1.
     - `direct`: how light gets to where it is scattered: `jvr.PiecewiseShadows()`, or another way of shadows.
 
@@ -71,7 +72,9 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
     radius: Scalar | None = parameter(NOT_NEGATIVE, doc="of the ball that light is scattered in", unit="mm")
     offset: Scalar | None = parameter(NOT_NEGATIVE, doc="how far from a point its rays begin", unit="mm")
     samples: int = choice(AT_LEAST_ONE, doc="segments along each ray")
-    resolution: float = choice(Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start")
+    resolution: float | None = choice(
+        Interval(0.0, 1.0, "(]"), doc="nodes for each voxel along an axis", hint="0.5 is a good start"
+    )
     bias: Scalar = parameter(UNIT_INTERVAL, doc="share of light that nothing takes away")
     direct: AbstractShadows = parameter(doc="a way of shadows such as jvr.PiecewiseShadows()")
     projected: ProjectedInScattering | None = parameter(doc="what has been computed beforehand")
@@ -85,7 +88,7 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
         radius: ArrayLike | None = None,
         offset: ArrayLike | None = None,
         samples: int = 16,
-        resolution: float | int = 0.5,
+        resolution: float | int | None = None,
         bias: ArrayLike = 0.0,
         direct: AbstractShadows = PiecewiseShadows(),
     ):
@@ -95,7 +98,7 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
         self.projected = None
 
     def knobs(self, scene: Scene) -> tuple[Knob, ...]:
-        return knobs_of_rays(self, multiples("resolution", self.resolution, (1 / 2, 1), 2, most=1.0))
+        return knobs_of_rays(self, resolutions(self, scene.volume))
 
     @property
     def stale_message(self) -> str:
@@ -110,7 +113,7 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
         return *sources_of_rays(scene), surfaces_of(scene), *lit, self.radius, self.offset
 
     def projection(self, scene: Scene, path: LightPath) -> "InScatteringProjection":
-        volume, shape = scene.volume, node_shape(scene.volume, self.resolution)
+        volume, resolution = scene.volume, resolution_for(self.resolution, scene.volume)
         medium = path(scene.transfer.takes_gradient)
         # Rays read the light also where nothing is visible, up to the ball's radius away from what is.
         everywhere: LightPath = lambda takes_gradient: path(takes_gradient)._replace(occupancy=None)
@@ -118,7 +121,7 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
             volume=volume,
             medium=medium,
             visibility=self.direct.visibility(scene, everywhere),
-            resolution=self.resolution,
+            resolution=resolution,
         )
         (found,) = project_all(incident, jnp.ones(len(incident.positions), bool))
         return InScatteringProjection(
@@ -126,10 +129,10 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
             clipping=scene.clipping,
             medium=seen_around(scene, medium),
             reach=Reach.of(self, volume),
-            incident=Grid.of(found.reshape(*shape, -1)),
+            incident=Grid.of(found.reshape(*incident.shape, -1)),
             lights=sum(light is not None for light in scene.shadow_casters),
             rays=self.rays,
-            resolution=self.resolution,
+            resolution=resolution,
         )
 
     def finished(self, scene: Scene, projection: Any, *nodes: Any) -> ProjectedInScattering:
@@ -143,7 +146,7 @@ class InScattering(AbstractPrecomputable, AbstractShadows):
         return InScatteringVisibility(Grid.of(taken), self.bias, casts, nodes_for_each_voxel(scene.volume, (x, y, z)))
 
     def _taken(self, volume: Volume, nodes: Float[Array, "nodes channels"]) -> Float[Array, "x y z channels"]:
-        return fractions_at_voxels(volume, nodes, self.resolution)
+        return fractions_at_voxels(volume, nodes, resolution_for(self.resolution, volume))
 
 
 class InScatteringVisibility(AbstractVisibility):

@@ -185,17 +185,19 @@ def darkness_at_voxels(
 
 def nodes_along(resolution: float | None, volume: Volume) -> Shape:
     """Nodes along each axis, for a resolution or none."""
-    return node_shape(volume, _default_resolution(volume) if resolution is None else resolution)
+    return node_shape(volume, resolution_for(resolution, volume))
 
 
-def _default_resolution(volume: Volume) -> float:
+def resolution_for(resolution: float | None, volume: Volume) -> float:
+    """Nodes for each voxel along an axis, for a resolution or none."""
+    if resolution is not None:
+        return resolution
     return 1.0 if math.prod(volume.shape) <= NODES else 0.5
 
 
-def resolutions(occlusion: Any, volume: Volume) -> Knob:
-    """The knob of a resolution, chosen or not."""
-    value = _default_resolution(volume) if occlusion.resolution is None else occlusion.resolution
-    return multiples("resolution", value, (1 / 2, 1), 2, most=1.0)
+def resolutions(part: Any, volume: Volume) -> Knob:
+    """The knob of a part's resolution, chosen or not."""
+    return multiples("resolution", resolution_for(part.resolution, volume), (1 / 2, 1), 2, most=1.0)
 
 
 class OcclusionProjection(AbstractProjection):

@@ -64,7 +64,9 @@ def measure(
     most = max(s.pixel_samples for s in settings)
     filters = {s.pixel_filter for s in settings if s.pixel_samples > 1} or {settings[0].pixel_filter}
     if len(filters) > 1:
-        raise ValueError("settings have different pixel filters, each of which makes another picture: measure those of one at a time")
+        raise ValueError(
+            "settings have different pixel filters, each of which makes another picture: measure those of one at a time"
+        )
     exact = Settings(step, termination=0.0, skipping=False, pixel_samples=most, pixel_filter=filters.pop())
     truth = reference(scene, camera, exact, unknowns)
     timed = timed_pictures([(scene, one) for one in settings], camera, unknowns, repeats=repeats)
