@@ -30,7 +30,7 @@ class LocalHistograms(eqx.Module):
     - `weights`: `(clusters, shells, bins)`: how much of each shell, that is of a part of a ray, has the scalar of a bin, the mean over the
       rays of a cluster; a scalar between two bins counts in both, by how near it is. The sum over the bins is 1, less what lies outside
       of the volume or has no data.
-    - `codes`: `(x, y, z, rays)`: the cluster of each ray of a node.
+    - `codes`: `(rays, x, y, z)`: the cluster of each ray of a node.
     - `positions`: `(bins,)`: the scalars of the bins.
     - `extents`: `(shells,)`: world lengths of the shells; `beyond`: the fraction of a ray that lies behind the last of them, where there is
       nothing.
@@ -39,7 +39,7 @@ class LocalHistograms(eqx.Module):
     """
 
     weights: Float[Array, "clusters shells bins"]
-    codes: UInt16[Array, "x y z rays"]
+    codes: UInt16[Array, "rays x y z"]
     positions: Float[Array, "bins"]
     extents: Float[Array, "shells"]
     beyond: Scalar

@@ -241,7 +241,7 @@ def test_histograms_are_those_of_brute_force():
     s, inside = along_rays(one, occlusion, node)
     assert np.all(inside)
     expected = np.mean(np.maximum(0, 1 - np.abs(s[..., None] - positions) / (positions[1] - positions[0])), axis=2)
-    np.testing.assert_allclose(np.asarray(held.weights)[np.asarray(held.codes)[node]], expected, atol=2e-5)
+    np.testing.assert_allclose(np.asarray(held.weights)[np.asarray(held.codes)[:, *node]], expected, atol=2e-5)
     # The extinction of each bin, as its hat sees it.
     table, looks = linear_transfer(), positions[:, None] + np.arange(-8, 9) / 9 * (positions[1] - positions[0])
     hat = 1 - np.abs(np.arange(-8, 9)) / 9
