@@ -29,7 +29,7 @@ from jvr.rendering.settings import Settings
 from jvr.rendering.trace import ahead, enter, near_volume, step_length
 from jvr.types import Scalar, Triple
 
-# Rays whose rows are held at a time; smaller batches lose the second core, larger ones fall out of the cache.
+# Rays whose rows are held at a time; larger batches fall out of the cache, and a subset of the rays does not fill them.
 CHUNK = 16_384
 # Blocks of neighbouring pixels, by which misfit is told from noise: rows of as many sums as there are unknowns are held for all of them.
 LEAST_SIDE, MOST_BLOCKS = 8, 4096
@@ -136,7 +136,8 @@ def observe(
     unknown: Collection[int] = (),
     among: Sequence[np.ndarray] | None = None,
 ) -> Observations:
-    """All pixels of all images as observations, in tiles of at most `chunk` rays, `CHUNK` without it. Sorted by how much of the volume they
+    """All pixels of all images as observations, in tiles of at most `chunk` rays, `CHUNK` without it, of all cores
+    of a processor together. Sorted by how much of the volume they
     cross, rays are dealt out in turn to the devices.
 
     `unknown`: the cameras that a fit finds; where there are any, rays are pixels. `among`: which pixels are taken, one mask for each image.
@@ -157,7 +158,9 @@ def observe(
         order = order[np.concatenate([np.ravel(mask) for mask in among])[order]]
     if unknown:
         rays = [_pixels(i, camera) for i, camera in enumerate(cameras)]
-    chunk = min(chunk or CHUNK, -(-order.size // shares()))
+    # Cores share one memory and its caches: together they take as many rays at a time as one device does.
+    most = -(-(chunk or CHUNK) // (shares() if jax.default_backend() == "cpu" else 1))
+    chunk = min(most, -(-order.size // shares()))
     together = chunk * shares()
     rank = np.arange(-(-order.size // together) * together, dtype=np.int32).reshape(-1, shares()).T.reshape(-1, chunk)
     pixel = order[np.minimum(rank, order.size - 1)]
