@@ -1,8 +1,8 @@
 """What ambient occlusion and in-scattering cost in time and error: each method over its knobs, against brute force.
 
-`python experiments/occlusion_accuracy.py [--json FILE] [--figure FILE] [--quick]`; the embedded volume, opaque, with all knobs;
-translucent, and a CT of a head where `$JVR_DATA` has it, with few. Errors are of the factor that light is multiplied with, whose largest
-value is 1: root mean squares over points in all that is visible, and over those that a picture shows. Brute force is
+`python experiments/occlusion_accuracy.py [--json FILE] [--figure FILE] [--quick] [--only surface]`; the embedded volume, opaque, with all
+knobs; translucent, and a CT of a head where `$JVR_DATA` has it, with few. Errors are of the factor that light is multiplied with, whose
+largest value is 1: root mean squares over points in all that is visible, and over those that a picture shows. Brute force is
 `experiments/numpy_occlusion.py`, in double precision: thousands of directions from each point, four samples a voxel. In-scattering is that
 of one directional light; its truth follows shadow rays to their ends, from fewer points in fewer directions. Occlusion of surfaces is that
 of an isosurface where the ramp begins.
@@ -164,6 +164,9 @@ def surfaces(subject: Subject, quick: bool) -> list[dict[str, Any]]:
     return rows
 
 
+PARTS = {"ambient": ambient, "in-scattering": scattered, "surface": surfaces}
+
+
 def costs(subject: Subject, plain: float, scene: Any) -> tuple[dict[str, float], Any]:
     """Seconds of what is computed beforehand, and of a picture over `plain`, those of one without; and the scene that keeps it."""
     kept = jvr.precompute(scene)
@@ -255,12 +258,17 @@ def main() -> None:
     parser.add_argument("--json", metavar="FILE")
     parser.add_argument("--figure", metavar="FILE", help="PNG of error against time")
     parser.add_argument("--quick", action="store_true", help="small volumes, few methods")
+    parser.add_argument("--only", choices=PARTS, help="this part alone; others stay as they are in the JSON")
     arguments = parser.parse_args()
+    before = json.loads(Path(arguments.json).read_text())["subjects"] if arguments.only and arguments.json else []
     results = []
     for k, subject in enumerate(subjects(arguments.quick)):
         heading(subject)
-        rows = [row for part in (ambient, scattered, surfaces) for row in part(subject, arguments.quick or k > 0)]
-        results.append({"subject": subject.name, "voxels": subject.scene.volume.shape, "rows": rows})
+        parts = [PARTS[arguments.only]] if arguments.only else PARTS.values()
+        rows = [row for part in parts for row in part(subject, arguments.quick or k > 0)]
+        new = {row["method"] for row in rows}
+        kept = [row for old in before if old["subject"] == subject.name for row in old["rows"] if row["method"] not in new]
+        results.append({"subject": subject.name, "voxels": subject.scene.volume.shape, "rows": kept + rows})
         if arguments.json:
             Path(arguments.json).write_text(json.dumps({"machine": machine(), "subjects": results}, indent=2) + "\n")
         if arguments.figure:

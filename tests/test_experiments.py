@@ -214,7 +214,8 @@ def test_the_fit_of_a_surface_runs(monkeypatch, tmp_path):
     assert report["renderers"]["rms_inside"] < 1e-5
     for row in report["derivatives"].values():
         # What no ray's derivative knows is at silhouettes, and is nearly all of the difference that there is.
-        assert row["missing_inside"] < 0.1
+        # Inside, what the surface's curve adds over half a voxel.
+        assert row["missing_inside"] < 0.3 * row["missing_at_silhouettes"]
         assert row["missing_at_silhouettes"] > 0.5
         assert row["difference_at_silhouettes"] > 0.9
     fit = next(row for row in report["fits"] if row["pictures"] == "jvr" and row["silhouettes"])
