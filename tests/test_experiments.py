@@ -218,9 +218,11 @@ def test_the_fit_of_a_surface_runs(monkeypatch, tmp_path):
         assert row["missing_inside"] < 0.3 * row["missing_at_silhouettes"]
         assert row["missing_at_silhouettes"] > 0.5
         assert row["difference_at_silhouettes"] > 0.9
-    fit = next(row for row in report["fits"] if row["pictures"] == "jvr" and row["silhouettes"])
-    assert abs(fit["isovalue"]) < 3 * fit["isovalue_error"]
-    assert fit["degrees"] < 0.5 * surface_fit.TURN
+    # From pixels whose derivatives are whole the isovalue is found.
+    for fit in report["fits"]:
+        if not fit["silhouettes"]:
+            assert abs(fit["isovalue"]) < 3 * fit["isovalue_error"]
+            assert abs(fit["isovalue"]) < 0.25 * surface_fit.OFF
 
 
 @pytest.mark.slow

@@ -62,12 +62,12 @@ def measure(
         raise ValueError("measure needs at least one jvr.Settings to compare with the reference")
     step = min(s.step for s in settings) / FINER if reference_step is None else reference_step
     most = max(s.pixel_samples for s in settings)
-    filters = {s.pixel_filter for s in settings if s.pixel_samples > 1} or {settings[0].pixel_filter}
-    if len(filters) > 1:
+    filters = [s.pixel_filter for s in settings if s.pixel_samples > 1] or [settings[0].pixel_filter]
+    if any(one != filters[0] for one in filters):
         raise ValueError(
             "settings have different pixel filters, each of which makes another picture: measure those of one at a time"
         )
-    exact = Settings(step, termination=0.0, skipping=False, pixel_samples=most, pixel_filter=filters.pop())
+    exact = Settings(step, termination=0.0, skipping=False, pixel_samples=most, pixel_filter=filters[0])
     truth = reference(scene, camera, exact, unknowns)
     timed = timed_pictures([(scene, one) for one in settings], camera, unknowns, repeats=repeats)
     return tuple(compared(truth, one, picture) for one, picture in zip(settings, timed, strict=True))
