@@ -260,7 +260,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small volumes, few methods")
     parser.add_argument("--only", choices=PARTS, help="this part alone; others stay as they are in the JSON")
     arguments = parser.parse_args()
-    before = json.loads(Path(arguments.json).read_text())["subjects"] if arguments.only and arguments.json else []
+    old_file = Path(arguments.json) if arguments.only and arguments.json else None
+    before = json.loads(old_file.read_text())["subjects"] if old_file and old_file.exists() else []
     results = []
     for k, subject in enumerate(subjects(arguments.quick)):
         heading(subject)

@@ -213,9 +213,9 @@ def test_the_fit_of_a_surface_runs(monkeypatch, tmp_path):
     # Two renderers that share nothing, but for pixels where single and double precision meet different things.
     assert report["renderers"]["rms_inside"] < 1e-5
     for row in report["derivatives"].values():
-        # What no ray's derivative knows is at silhouettes, and is nearly all of the difference that there is.
         # Inside, what the surface's curve adds over half a voxel.
         assert row["missing_inside"] < 0.3 * row["missing_at_silhouettes"]
+        # What no ray's derivative knows is at silhouettes, and is nearly all of the difference that there is.
         assert row["missing_at_silhouettes"] > 0.5
         assert row["difference_at_silhouettes"] > 0.9
     # From pixels whose derivatives are whole the isovalue is found.

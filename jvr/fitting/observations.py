@@ -136,9 +136,8 @@ def observe(
     unknown: Collection[int] = (),
     among: Sequence[np.ndarray] | None = None,
 ) -> Observations:
-    """All pixels of all images as observations, in tiles of at most `chunk` rays, `CHUNK` without it, of all cores
-    of a processor together. Sorted by how much of the volume they
-    cross, rays are dealt out in turn to the devices.
+    """All pixels of all images as observations, in tiles of at most `chunk` rays, `CHUNK` without it, of all cores of a
+    processor together. Sorted by how much of the volume they cross, rays are dealt out in turn to the devices.
 
     `unknown`: the cameras that a fit finds; where there are any, rays are pixels. `among`: which pixels are taken, one mask for each image.
 

@@ -17,8 +17,17 @@ from jvr.io.config.text import read_toml
 Override = tuple[str, Any]
 # Tables whose values may be others where a fit starts.
 INITIAL = (
-    *("camera", "lights", "shading", "scattering", "background", "environment", "material", "radiance_transfer", "occlusion"),
-    *("surfaces", "specular"),
+    "camera",
+    "lights",
+    "shading",
+    "scattering",
+    "background",
+    "environment",
+    "material",
+    "radiance_transfer",
+    "occlusion",
+    "surfaces",
+    "specular",
 )
 # Keys of one table that exclude each other.
 ALTERNATIVES = {"path": "builtin", "fov_y": "half_angle_tangent", "opacity": "sigma_t"}
