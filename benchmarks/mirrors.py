@@ -23,10 +23,9 @@ def mirrors() -> dict[str, Any]:
     grid = np.indices((VOXELS,) * 3).astype(np.float32) - (VOXELS - 1) / 2
     volume = jvr.Volume(-np.sum(np.square(grid), axis=0))
     camera, settings = scenes.camera(volume, SIZE), jvr.Settings(0.5)
-    clear = jvr.LinearTransfer([-1e5, 1.0], np.zeros((2, 3)), [0.0, 0.0])
     sky = jvr.EnvironmentMap.gradient((0.1, 0.1, 0.1), (0.9, 0.8, 0.7), (0.1, 0.2, 0.6))
     level, black = [-((0.4 * VOXELS) ** 2)], np.zeros((1, 3))
-    opaque = jvr.Scene(volume, clear, surfaces=jvr.Isosurfaces(level, black), background=sky)
+    opaque = jvr.Scene(volume, surfaces=jvr.Isosurfaces(level, black), background=sky)
     glass = dataclasses.replace(opaque, surfaces=jvr.Isosurfaces(level, black, [0.0], most=2))
     draw = jax.jit(lambda scene: jvr.render(scene, camera, settings).rgb)
     pictures = {"opaque": opaque, "clear": glass}

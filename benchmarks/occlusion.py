@@ -24,9 +24,8 @@ def occlusion() -> dict[str, Any]:
     camera, settings = scenes.camera(volume, SIZE), jvr.Settings(0.5)
     lights = (jvr.AmbientLight(0.5), jvr.DirectionalLight((-1.0, -0.6, -1.2)))
     plain = jvr.Scene(volume, scenes.opaque(), lights=lights, shading=jvr.Lambert())
-    clear = jvr.LinearTransfer([-2.0, 2.0], np.zeros((2, 3)), [0.0, 0.0])
     surface = jvr.Isosurfaces([LEVEL], np.full((1, 3), 0.7))
-    hit = jvr.Scene(volume, clear, surfaces=surface, lights=lights, shading=jvr.Lambert())
+    hit = jvr.Scene(volume, surfaces=surface, lights=lights, shading=jvr.Lambert())
     numbers = {"rays": RAYS, "resolution": RESOLUTION}
     methods = {"local": jvr.LocalOcclusion(**numbers), "histogram": jvr.HistogramOcclusion(**numbers)}
     found: dict[str, Any] = {}

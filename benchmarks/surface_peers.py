@@ -23,10 +23,8 @@ def surface_peers() -> dict[str, Any]:
     volume = scenes.gyroid()
     camera, center = scenes.camera(volume, SIZE), np.asarray(volume.center)
     towards = center - np.asarray(camera.world_from_camera[:3, 3])
-    clear = jvr.LinearTransfer([-2.0, 2.0], np.zeros((2, 3)), [0.0, 0.0])
     scene = jvr.Scene(
         volume,
-        clear,
         surfaces=jvr.Isosurfaces([LEVEL], np.full((1, 3), 0.7)),
         lights=(jvr.DirectionalLight(towards),),
         shading=jvr.Lambert(0.2, 0.8),

@@ -23,8 +23,7 @@ def surfaces() -> dict[str, Any]:
     volume = scenes.gyroid()
     camera, settings = scenes.camera(volume, SIZE), jvr.Settings(0.5)
     wall = jvr.LinearTransfer([LEVEL - 0.01, LEVEL + 0.01], np.full((2, 3), 0.7), [0.0, 20.0])
-    clear = jvr.LinearTransfer([-2.0, 2.0], np.zeros((2, 3)), [0.0, 0.0])
-    hit = jvr.Scene(volume, clear, surfaces=jvr.Isosurfaces([LEVEL], np.full((1, 3), 0.7)))
+    hit = jvr.Scene(volume, surfaces=jvr.Isosurfaces([LEVEL], np.full((1, 3), 0.7)))
     medium, thin = jvr.Scene(volume, scenes.opaque()), jvr.Scene(volume, wall)
     sky = jvr.Scene(volume, scenes.opaque(), background=jvr.EnvironmentMap(np.ones((128, 256, 3))))
     lit = {"lights": (jvr.DirectionalLight((-1.0, -0.6, -1.2)),), "shading": jvr.Lambert(0.2, 0.8)}

@@ -74,10 +74,8 @@ def study(quick: bool) -> Study:
     values = np.asarray(volume.values, float)
     near = np.abs(values - level) < 0.1
     slope = float(np.median(np.linalg.norm(np.gradient(values), axis=0)[near]))
-    clear = jvr.LinearTransfer([0.0, 1.0], np.zeros((2, 3)), [0.0, 0.0])
     scene = jvr.Scene(
         volume,
-        clear,
         surfaces=jvr.Isosurfaces([level], [RGB], step=0.5),
         lights=(*(jvr.DirectionalLight(way) for way in LIGHTS), jvr.AmbientLight(1.0)),
         shading=jvr.BlinnPhong(*REFLECTANCE),

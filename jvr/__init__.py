@@ -132,6 +132,7 @@ if TYPE_CHECKING:
     from jvr.model.phase import Rayleigh as Rayleigh
     from jvr.model.phase import Schlick as Schlick
     from jvr.model.scene import Scene as Scene
+    from jvr.model.transfer import ClearTransfer as ClearTransfer
     from jvr.model.transfer import GaussianTransfer as GaussianTransfer
     from jvr.model.transfer import LinearTransfer as LinearTransfer
     from jvr.model.transfer import LutTransfer as LutTransfer

@@ -108,7 +108,7 @@ NAMES = {
     "jvr.model.optical": ("AbsorptionOnly", "EmissionAbsorption", "EmissionOnly"),
     "jvr.model.phase": ("DoubleHenyeyGreenstein", "HenyeyGreenstein", "Isotropic", "Mixture", "Rayleigh", "Schlick"),
     "jvr.model.scene": ("Scene",),
-    "jvr.model.transfer": ("GaussianTransfer", "LinearTransfer", "LutTransfer"),
+    "jvr.model.transfer": ("ClearTransfer", "GaussianTransfer", "LinearTransfer", "LutTransfer"),
     "jvr.model.volume": ("Volume",),
     "jvr.pictures": ("linear_from_srgb", "srgb_from_linear", "write_image"),
     "jvr.rendering.advise": ("Advice", "advise"),

@@ -96,6 +96,7 @@ KINDS: dict[type, dict[str, str]] = {
         "lut": "LutTransfer",
         "gaussian": "GaussianTransfer",
         "gradient": "GradientTransfer",
+        "clear": "ClearTransfer",
     },
     AbstractBleeding: {"transfer": "TransferBleeding", "material": "MaterialBleeding"},
     AbstractBRDF: {

@@ -96,12 +96,14 @@ class Search(eqx.Module):
 
 
 class Reached(NamedTuple):
-    """Where rays have come to: at distance `u`, between samples `k` and `k + 1`, on a `side` of the isovalues; `on`: whether they go on."""
+    """Where rays have come to: at distance `u`, between samples `k` and `k + 1`, on a `side` of the isovalues; `on`: whether they go on;
+    `s`: the scalar there, no number where it was not sampled."""
 
     u: Float[Array, "rays"]
     k: Int[Array, "rays"]
     side: Int[Array, "rays"]
     on: Bool[Array, "rays"]
+    s: Float[Array, "rays"]
 
 
 class Hits(NamedTuple):
@@ -125,7 +127,8 @@ def start(search: Search, rays: Rays) -> Reached:
     if search.occupancy is not None:
         k = jax.lax.fori_loop(0, FIRST_SKIPS, lambda _, k: jnp.minimum(k + search.skip(rays, k), segments), k)
     u = jnp.minimum(k * search.dt, rays.length)
-    return jax.lax.stop_gradient(Reached(u, k, search.sample(rays, u)[1], k < segments))
+    s, side = search.sample(rays, u)
+    return jax.lax.stop_gradient(Reached(u, k, side, k < segments, s))
 
 
 def leaving(search: Search, rays: Rays, hits: Hits, crosses: Bool[Array, "rays"]) -> Reached:
@@ -134,7 +137,7 @@ def leaving(search: Search, rays: Rays, hits: Hits, crosses: Bool[Array, "rays"]
     before = 2 * hits.surface + 1 - hits.reached.side
     near = jnp.minimum(SETS_OFF * search.tolerance, rays.length)
     side = jnp.where(crosses, hits.reached.side, before)
-    return jax.lax.stop_gradient(Reached(near, jnp.zeros_like(side), side, hits.found))
+    return jax.lax.stop_gradient(Reached(near, jnp.zeros_like(side), side, hits.found, _not_sampled(near)))
 
 
 @jax.custom_jvp
@@ -204,7 +207,8 @@ def passed(search: Search, rays: Rays, opacity: Float[Array, "n"] | None, most: 
 
 
 class _Brackets(NamedTuple):
-    """Between which distances rays cross a surface, if they do; `side`: in front of it."""
+    """Between which distances rays cross a surface, if they do; `side`: in front of it; `s`, `ahead`: the scalar at either end, `s` no
+    number where it was not sampled."""
 
     front: Float[Array, "rays"]
     back: Float[Array, "rays"]
@@ -213,6 +217,8 @@ class _Brackets(NamedTuple):
     there: Bool[Array, "rays"]
     k: Int[Array, "rays"]
     steps: Int[Array, "rays"]
+    s: Float[Array, "rays"]
+    ahead: Float[Array, "rays"]
 
     @property
     def surface(self) -> Int[Array, "rays"]:
@@ -221,26 +227,25 @@ class _Brackets(NamedTuple):
 
     def beyond(self, u: Float[Array, "rays"]) -> Reached:
         """Where rays go on that cross it at distance `u`."""
-        return Reached(u, self.k, jnp.where(self.rises, self.side + 1, self.side - 1), self.there)
+        return Reached(u, self.k, jnp.where(self.rises, self.side + 1, self.side - 1), self.there, _not_sampled(u))
 
 
-class _Far(NamedTuple):
-    """What says how far a ray may go: the scalar of its last sample, where that is `known`, and up to which sample steps are small."""
-
-    s: Float[Array, "rays"]
-    known: Bool[Array, "rays"]
-    fine_until: Int[Array, "rays"]
+def _not_sampled(u: Float[Array, "rays"]) -> Float[Array, "rays"]:
+    return jnp.full_like(u, jnp.nan)
 
 
 class _Progress(NamedTuple):
-    """The state of a ray that is searched: its last sample and the side of it; `crossed`: one more than the side of the next, where that is
-    another, else 0."""
+    """The state of a ray that is searched: the sample that it has come to, the side of it and, unless it was skipped to, its scalar `s`;
+    `crossed`: one more than the side of the next, where that is another, else 0; `ahead`: the scalar there; `fine_until`: up to which
+    sample steps are small, where others may be larger."""
 
     k: Int[Array, "rays"]
     side: Int[Array, "rays"]
     crossed: Int[Array, "rays"]
     steps: Int[Array, "rays"]
-    far: _Far | None
+    s: Float[Array, "rays"]
+    ahead: Float[Array, "rays"]
+    fine_until: Int[Array, "rays"] | None
 
 
 class _Way(NamedTuple):
@@ -256,9 +261,8 @@ def _brackets(search: Search, rays: Rays, reached: Reached) -> _Brackets:
     segments = jnp.where(reached.on, segment_count(rays.length, search.dt), 0)
 
     def begin(way: _Way) -> _Progress:
-        zero = jnp.zeros_like(way.reached.k)
-        far = _Far(jnp.zeros_like(way.rays.length), zero > 0, zero) if search.leaps else None
-        return _Progress(way.reached.k, way.reached.side, zero, zero, far)
+        reached, zero = way.reached, jnp.zeros_like(way.reached.k)
+        return _Progress(reached.k, reached.side, zero, zero, reached.s, reached.s, zero if search.leaps else None)
 
     def alive(way: _Way, progress: _Progress) -> Bool[Array, "rays"]:
         return (progress.crossed == 0) & (progress.k < way.segments)
@@ -267,40 +271,46 @@ def _brackets(search: Search, rays: Rays, reached: Reached) -> _Brackets:
         on = alive(way, progress)
         skipped = search.skip(way.rays, progress.k)
         k = jnp.minimum(progress.k + skipped, way.segments)
-        stride = jnp.ones_like(k)
-        far = progress.far
-        if far is not None:
-            may = far.known & (skipped == 0) & (k >= far.fine_until)
-            stride = jnp.where(may, search.stride(way.rays, k, far.s), 1)
+        s = jnp.where(skipped > 0, jnp.nan, progress.s)
+        stride, fine_until = jnp.ones_like(k), progress.fine_until
+        if fine_until is not None:
+            may = ~jnp.isnan(s) & (k >= fine_until)
+            stride = jnp.where(may, search.stride(way.rays, k, s), 1)
         following = jnp.minimum(k + stride, way.segments)
-        s, side = search.sample(way.rays, jnp.minimum(following * search.dt, way.rays.length))
+        ahead, side = search.sample(way.rays, jnp.minimum(following * search.dt, way.rays.length))
         sampled = on & (k < way.segments)
         crosses = sampled & (side != progress.side) & (side != MISSING) & (progress.side != MISSING)
         passed = sampled & ~crosses
-        if far is not None:
+        if fine_until is not None:
             # What a larger step has passed is looked at again.
             again = crosses & (following > k + 1)
             crosses = crosses & ~again
-            known = passed | (far.known & (skipped == 0))
-            far = _Far(jnp.where(passed, s, far.s), known, jnp.where(again, following, far.fine_until))
-        k = jnp.where(passed, following, jnp.where(on, k, progress.k))
-        side_before = jnp.where(passed, side, progress.side)
-        crossed = jnp.where(crosses, side + 1, progress.crossed)
-        return _Progress(k, side_before, crossed, progress.steps + sampled, far), None
+            fine_until = jnp.where(again, following, fine_until)
+        reached = lambda new, kept, before: jnp.where(passed, new, jnp.where(on, kept, before))
+        return _Progress(
+            reached(following, k, progress.k),
+            jnp.where(passed, side, progress.side),
+            jnp.where(crosses, side + 1, progress.crossed),
+            progress.steps + sampled,
+            reached(ahead, s, progress.s),
+            jnp.where(crosses, ahead, progress.ahead),
+            fine_until,
+        ), None
 
     work = jnp.where(reached.on, jnp.maximum(segments - reached.k, 0), 0)
-    finish = lambda progress: progress._replace(far=None)
+    finish = lambda progress: progress._replace(fine_until=None)
     found, _ = wavefront_while(alive, advance, begin, finish, _Way(rays, segments, reached), None, work, IDLE_SEARCH)
-    there = found.crossed > 0
+    there, rises = found.crossed > 0, found.crossed - 1 > found.side
     # The lattice goes on behind a surface; what is in front of it is known.
     front = jnp.maximum(jnp.minimum(found.k * search.dt, rays.length), jnp.where(reached.on, reached.u, 0.0))
-    back = jnp.minimum((found.k + 1) * search.dt, rays.length)
-    return _Brackets(front, jnp.maximum(front, back), found.side, found.crossed - 1 > found.side, there, found.k, found.steps)
+    back = jnp.maximum(front, jnp.minimum((found.k + 1) * search.dt, rays.length))
+    return _Brackets(front, back, found.side, rises, there, found.k, found.steps, found.s, found.ahead)
 
 
 class _Enclosed(NamedTuple):
     """A bracket that is made smaller: its ends, by how much the scalar is below the isovalue at the front, negative, and above it at the
-    back, positive (both with the sign of the crossing); how much of the length that bisection would leave is not used up (`room`)."""
+    back, positive (both with the sign of the crossing; `below` no number until it is sampled); how much of the length that bisection would
+    leave is not used up (`room`)."""
 
     front: Float[Array, "rays"]
     back: Float[Array, "rays"]
@@ -326,26 +336,28 @@ def _enclosed(search: Search, rays: Rays, found: _Brackets) -> tuple[Float[Array
     tiny = jnp.finfo(rays.length.dtype).tiny
     sign = jnp.where(found.rises, 1.0, -1.0).astype(rays.length.dtype)
     crossing = _Crossing(rays, search.values[jnp.clip(found.surface, 0, search.values.size - 1)], sign, found)
-    excess = lambda crossing, u: crossing.sign * (search.sample(crossing.rays, u)[0] - crossing.value)
+    excess = lambda crossing, s: crossing.sign * (s - crossing.value)
 
     def begin(crossing: _Crossing) -> _Enclosed:
         bracket = crossing.bracket
         # Which side either end is on is known; rounding has no say in it.
-        below = jnp.minimum(excess(crossing, bracket.front), -tiny)
-        above = jnp.maximum(excess(crossing, bracket.back), tiny)
-        room = jnp.full_like(bracket.front, 2.0 ** (halvings + 2)) * least
-        return _Enclosed(bracket.front, bracket.back, below, above, room, jnp.full_like(bracket.k, 2))
+        below = jnp.minimum(excess(crossing, bracket.s), -tiny)
+        above = jnp.maximum(excess(crossing, bracket.ahead), tiny)
+        # The step that samples the front takes its part of the room as well.
+        room = 2.0 ** (halvings + 2) * least * jnp.where(jnp.isnan(below), 2.0, 1.0)
+        return _Enclosed(bracket.front, bracket.back, below, above, room, jnp.zeros_like(bracket.k))
 
     def alive(_: _Crossing, state: _Enclosed) -> Bool[Array, "rays"]:
-        return (state.back - state.front > 2 * least) & (state.room > least / 4)
+        return (jnp.isnan(state.below) | (state.back - state.front > 2 * least)) & (state.room > least / 4)
 
     def advance(crossing: _Crossing, state: _Enclosed, _: None) -> tuple[_Enclosed, None]:
         on, width = alive(crossing, state), state.back - state.front
-        u = _between(state, width, search.dt)
-        found = excess(crossing, u)
-        low = found < 0
+        starts = jnp.isnan(state.below)
+        u = jnp.where(starts, state.front, _between(state, width, search.dt))
+        found = excess(crossing, search.sample(crossing.rays, u)[0])
+        low = starts | (found < 0)
         move = lambda where, new, old: jnp.where(on & where, new, old)
-        front, below = move(low, u, state.front), move(low, found, state.below)
+        front, below = move(low, u, state.front), move(low, jnp.minimum(found, -tiny), state.below)
         back, above = move(~low, u, state.back), move(~low, jnp.maximum(found, tiny), state.above)
         return _Enclosed(front, back, below, above, jnp.where(on, state.room / 2, state.room), state.steps + on), None
 

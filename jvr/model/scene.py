@@ -30,7 +30,7 @@ from jvr.model.optical import AbstractOpticalModel, EmissionAbsorption
 from jvr.model.parameters import assign, parameter
 from jvr.model.parts import AbstractPart, PlanEntry, asks_gradient, parts_of
 from jvr.model.ranges import COLOUR
-from jvr.model.transfer import AbstractTransfer
+from jvr.model.transfer import AbstractTransfer, ClearTransfer
 from jvr.model.volume import Volume
 from jvr.types import ArrayLike, Vector
 
@@ -41,7 +41,8 @@ class Scene(AbstractPart):
     **Arguments:**
 
     - `volume`: `jvr.Volume`.
-    - `transfer`: a transfer function, `jvr.LinearTransfer`, `jvr.LutTransfer` or `jvr.GaussianTransfer`.
+    - `transfer`: a transfer function, `jvr.LinearTransfer`, `jvr.LutTransfer`, `jvr.GaussianTransfer`, `jvr.GradientTransfer`, or `None`:
+      the medium shows nothing (`jvr.ClearTransfer`), and surfaces or geometry are all there is.
     - `background`: what shows through what is transparent: `(3,)` linear RGB, `jvr.EnvironmentMap`, or `None`.
     - `optical`: `jvr.EmissionAbsorption()` (default), `jvr.EmissionOnly()` or `jvr.AbsorptionOnly()`.
     - `clipping`: what is left of the volume: `jvr.ClippingBox`, `jvr.ClippingPlane`, several of them in a row, or `None`: all of it.
@@ -65,10 +66,10 @@ class Scene(AbstractPart):
     - `surfaces`: `jvr.Isosurfaces(...)`, shaded as the medium is, or `None`.
     - `specular`: how surfaces mirror and bend rays, `jvr.Specular(...)`, or `None`: not at all.
 
-    **Raises** `ValueError` for shadows without a light, or with nothing that shows light; for occlusion without ambient light, or with
-    nothing that shows it, and that of surfaces without these; for one of environment and material without the other, and for radiance
-    transfer without both; for surfaces between nearest voxels, or whose normals are those of the opacity; for a specular part without
-    surfaces, or with a depth image.
+    **Raises** `ValueError` for a scene that shows nothing; for shadows without a light, or with nothing that shows light; for occlusion
+    without ambient light, or with nothing that shows it, and that of surfaces without these; for one of environment and material without
+    the other, and for radiance transfer without both; for surfaces between nearest voxels, or whose normals are those of the opacity; for
+    a specular part without surfaces, or with a depth image.
     """
 
     volume: Volume = parameter(doc="a jvr.Volume, as jvr.read_volume gives it")
@@ -95,7 +96,7 @@ class Scene(AbstractPart):
     def __init__(
         self,
         volume: Volume,
-        transfer: AbstractTransfer,
+        transfer: AbstractTransfer | None = None,
         *,
         background: ArrayLike | EnvironmentMap | None = None,
         optical: AbstractOpticalModel = EmissionAbsorption(),
@@ -115,6 +116,12 @@ class Scene(AbstractPart):
     ):
         # None of several is no clipping.
         clipping = clipping if isinstance(clipping, AbstractClipping) or clipping else None
+        if transfer is None:
+            if surfaces is None and geometry is None:
+                raise ValueError(
+                    "this scene shows nothing: give it a transfer function, surfaces=jvr.Isosurfaces(...) or geometry="
+                )
+            transfer = ClearTransfer()
         assign(self, volume=volume, transfer=transfer, background=background, optical=optical, clipping=clipping)
         assign(self, lights=lights, shading=shading, shadows=shadows, scattering=scattering, normals=normals)
         assign(self, environment=environment, material=material, radiance_transfer=radiance_transfer, geometry=geometry)

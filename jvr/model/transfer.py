@@ -42,6 +42,8 @@ class AbstractTransfer(AbstractPart):
 
     # Whether `evaluate` takes the length of the gradient (per world length) as well.
     takes_gradient: ClassVar[bool] = False
+    # Whether it shows nothing whatever the scalar is: no medium is then marched through.
+    is_clear: ClassVar[bool] = False
 
     @property
     def needs_gradient(self) -> bool:
@@ -239,6 +241,25 @@ class GaussianTransfer(AbstractTransfer):
         largest = lambda height: jnp.sum(jnp.abs(height) * jnp.exp(-0.5 * jnp.square((nearest - self.center) / self.width)))
         visible = ~(largest(height) <= least)
         return visible if self.emission is None else visible | ~(largest(jnp.max(self.emission, axis=1)) <= least)
+
+
+class ClearTransfer(AbstractTransfer):
+    """Shows nothing: extinction 0 of every scalar. The medium of a scene of isosurfaces or geometry alone, which is not marched through."""
+
+    is_clear: ClassVar[bool] = True
+
+    def explain(self, name: str, scene: Any, settings: Any) -> tuple[PlanEntry, ...]:
+        return (PlanEntry(name, False, "the medium shows nothing and is not marched through"),)
+
+    def evaluate(self, s: Scalar, magnitude: Scalar | None = None) -> Classified:
+        nothing = jnp.zeros_like(s)
+        return Classified((nothing,) * 3, (nothing,))
+
+    def is_visible(self, low: Scalar, high: Scalar, least: Scalar | float = 0.0, *, nearby: bool = False) -> Bool[Array, ""]:
+        return jnp.zeros((), bool)
+
+    def _repr_html_(self) -> str:
+        return "<div>ClearTransfer: shows nothing</div>"
 
 
 def shown_entries(columns: Sequence[Float[Array, "n ..."]], least: Scalar | float) -> Bool[Array, "n"]:

@@ -4,12 +4,12 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from jvr.march.march import Marched, MarchOptions
+from jvr.march.march import Marched
 from jvr.march.steps import Rays
 from jvr.model.scene import Scene
 from jvr.rendering.geometry import lit_where_rays_end
 from jvr.rendering.integrator import AbstractRayIntegrator, Radiance
-from jvr.rendering.medium import Prepared, medium
+from jvr.rendering.medium import Prepared, marched, medium
 from jvr.rendering.specular import seen_in_mirrors
 from jvr.rendering.surfaces import blended_with_surfaces, ended_at_surfaces
 from jvr.rendering.trace import composite, seen_end
@@ -25,20 +25,16 @@ class Uniform(AbstractRayIntegrator):
         return "every ray, evenly spaced samples"
 
     def radiance(self, prepared: Prepared, rays: Rays) -> Radiance:
-        settings = prepared.settings
-        options = MarchOptions(settings.termination, True)
         through, surfaces = medium(prepared), prepared.scene.surfaces
         rays = lit_where_rays_end(prepared, through, rays)
         if surfaces is None:
-            gathered = settings.adjoint.march(options, through, rays.without_end, prepared.dt)
-            return radiance_of(prepared.scene, gathered, rays)
+            return radiance_of(prepared.scene, marched(prepared, through, rays.without_end), rays)
         if prepared.scene.specular is not None and prepared.scene.specular.order:
             return seen_in_mirrors(prepared, through, rays)
         if not surfaces.is_opaque:
             return blended_with_surfaces(prepared, through, rays)
         rays, steps = ended_at_surfaces(prepared, through, rays)
-        gathered = settings.adjoint.march(options, through, rays.without_end, prepared.dt)
-        found = radiance_of(prepared.scene, gathered, rays)
+        found = radiance_of(prepared.scene, marched(prepared, through, rays.without_end), rays)
         return found._replace(steps=found.steps + steps)
 
 

@@ -14,11 +14,13 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from jvr.march.fields import VoxelField
+from jvr.march.march import Marched, MarchOptions
 from jvr.march.medium import DENSEST, AbstractVisibility, Medium, Visibilities
 from jvr.march.occupancy import Occupancy, occupancy_of
 from jvr.march.quadrature import PreIntegrated
 from jvr.march.shaders import GradientFrame, LightPathShader, OpticalShader, PreIntegratedShader
 from jvr.march.steepest import steepest_gradients
+from jvr.march.steps import Rays
 from jvr.model.bricks import Bricks, bricks_of, widened
 from jvr.model.normals import AbstractNormals
 from jvr.model.optical import AbsorptionOnly
@@ -86,16 +88,24 @@ def medium(prepared: Prepared, *, graded: bool = False) -> Medium:
     frame, normals = _gradients(scene, graded=graded)
     field = VoxelField(scene.volume, normals)
     quadrature = settings.quadrature
-    pre_integrated = quadrature.pre_integrates
+    pre_integrated = quadrature.pre_integrates and not scene.transfer.is_clear
     if scene.shows_light:
         shader = lighting_module().lit_shader(scene, frame, prepared.lighting, pre_integrated=pre_integrated)
     else:
         shader = (PreIntegratedShader if pre_integrated else OpticalShader)(scene.optical, frame)
-    if not isinstance(quadrature, PreIntegrated):
+    if scene.transfer.is_clear or not isinstance(quadrature, PreIntegrated):
         return Medium(field, scene.transfer, shader, prepared.occupancy, prepared.visibility)
     # Checks the transfer function's type itself.
     table = PreIntegratedTable(cast(Any, scene.transfer), quadrature.parts)
     return Medium(field, table, shader, prepared.occupancy, prepared.visibility)
+
+
+def marched(prepared: Prepared, through: Medium, rays: Rays) -> Marched:
+    """What rays gather in the medium; nothing, and no march, where it is clear."""
+    settings = prepared.settings
+    if prepared.scene.transfer.is_clear:
+        return Marched((), (), (), jnp.zeros_like(rays.length, jnp.int32))
+    return settings.adjoint.march(MarchOptions(settings.termination, distance=True), through, rays, prepared.dt)
 
 
 def lighting_module() -> Any:

@@ -13,14 +13,13 @@ import numpy as np
 from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Float
 
-from jvr.march.march import MarchOptions
 from jvr.march.medium import Medium
 from jvr.march.segments import channel_counts
 from jvr.march.steps import Rays
 from jvr.numerics import transformed
 from jvr.rendering.geometry import lit_where_rays_end
 from jvr.rendering.integrator import Radiance
-from jvr.rendering.medium import Prepared
+from jvr.rendering.medium import Prepared, marched
 from jvr.rendering.surfaces import Seen, behind_layer, behind_stretch, nothing_seen, spread
 from jvr.rendering.trace import behind, enter
 from jvr.types import Channels, Triple
@@ -115,7 +114,7 @@ def _walked(prepared: Prepared, medium: Medium, path: _Path, seen: Seen, step: _
 
 
 def _walk(prepared: Prepared, medium: Medium, path: _Path, seen: Seen, step: _Step) -> tuple[Seen, _Path, _Path]:
-    scene, settings, search = prepared.scene, prepared.settings, prepared.search
+    scene, search = prepared.scene, prepared.search
     surfaces, specular = scene.surfaces, scene.specular
     assert surfaces is not None
     assert specular is not None
@@ -123,7 +122,7 @@ def _walk(prepared: Prepared, medium: Medium, path: _Path, seen: Seen, step: _St
     way = rays.without_end._replace(length=jnp.where(path.on, rays.length, 0.0))
     hits = surfaces.next_hit(search, way, path.reached._replace(on=path.reached.on & path.on & step.looks))
     stretch = way._replace(length=jnp.where(hits.found, hits.u, way.length))
-    gathered = settings.adjoint.march(MarchOptions(settings.termination, distance=True), medium, stretch, prepared.dt)
+    gathered = marched(prepared, medium, stretch)
     local = behind_stretch(nothing_seen(rays, len(path.clear))._replace(u=path.u), gathered)
     before, at = local.clear, path.u + hits.u
     fraction, mirror, onward = specular.deflected(scene.volume, medium, way, hits)

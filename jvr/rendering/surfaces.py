@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jvr.march.march import Marched, MarchOptions
+from jvr.march.march import Marched
 from jvr.march.medium import Medium
 from jvr.march.segments import channel_counts
 from jvr.march.steps import End, Rays
 from jvr.numerics import one_minus_exp
 from jvr.rendering.integrator import Radiance
-from jvr.rendering.medium import Prepared
+from jvr.rendering.medium import Prepared, marched
 from jvr.rendering.trace import behind
 from jvr.types import Channels
 
@@ -52,7 +52,7 @@ def blended_with_surfaces(prepared: Prepared, medium: Medium, rays: Rays) -> Rad
     """What rays bring through surfaces that they meet: stretches of the medium between them, `L <- L1 + T1 (a c + (1 - a) L2)`."""
     settings, surfaces = prepared.settings, prepared.scene.surfaces
     assert surfaces is not None
-    way, options = rays.without_end, MarchOptions(settings.termination, distance=True)
+    way = rays.without_end
     n = max(channel_counts(medium, way, prepared.dt)[1], 1)
     # Not alive, but not to be lost either: a ray that is no number is marched, and brings none.
     start = surfaces.start(prepared.search, way)
@@ -63,7 +63,7 @@ def blended_with_surfaces(prepared: Prepared, medium: Medium, rays: Rays) -> Rad
         end = jnp.where(hits.found, hits.u, way.length)
         entry = tuple(e + seen.u * d for e, d in zip(way.entry, way.direction, strict=True))
         part = Rays(entry, way.direction, jnp.where(on, end - seen.u, 0.0))
-        gathered = settings.adjoint.march(options, medium, part, prepared.dt)
+        gathered = marched(prepared, medium, part)
         passed = behind_stretch(seen, gathered)
         rgb, opacity = surfaces.shown(medium, way, hits)
         passed = behind_layer(passed, rgb, opacity, hits.u)

@@ -88,9 +88,7 @@ def write_fit_page(
         f'<p class="lead">{verdict(result, targets, fitted)}</p>',
         summary(result, targets, fitted),
         _pictures(targets, fitted, before),
-        # What depends on the gradient as well is no curve; its fitted numbers are among the other values.
-        *([] if transfer.takes_gradient else [_transfer(transfer, errors, truth, histogram, _reached_by_light(transfer))]),
-        *([] if transfer.takes_gradient else [transfer_values(transfer, errors)]),
+        *_curves(transfer, errors, truth, histogram),
         other_values(result.scene, result.errors_by_name),
         camera_values(result.cameras, result.errors_by_name),
         identifiability(result, transfer),
@@ -123,6 +121,16 @@ def _document(title: str, body: str) -> str:
 </body>
 </html>
 """
+
+
+def _curves(
+    transfer: AbstractTransfer, errors: dict[str, np.ndarray], truth: AbstractTransfer | None, histogram: Any
+) -> list[str]:
+    """The curve and the values of a transfer function. What depends on the gradient as well is no curve; its fitted numbers are among the
+    other values."""
+    if transfer.takes_gradient or transfer.is_clear:
+        return []
+    return [_transfer(transfer, errors, truth, histogram, _reached_by_light(transfer)), transfer_values(transfer, errors)]
 
 
 def _reached_by_light(transfer: AbstractTransfer) -> bool:
