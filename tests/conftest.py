@@ -30,7 +30,7 @@ import pytest
 if "JVR_TEST_DEVICES" in os.environ:
     jax.config.update("jax_num_cpu_devices", int(os.environ["JVR_TEST_DEVICES"]))
 
-MANY_MAPS = 30_000
+MANY_MAPS = 12_000
 DATA = Path(os.environ.get("JVR_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
