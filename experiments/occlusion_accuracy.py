@@ -51,7 +51,7 @@ class Subject(NamedTuple):
 
 def subjects(quick: bool) -> list[Subject]:
     """Every subject; smaller where that is to be `quick`."""
-    count, rays = (40, 500) if quick else (300, 4096)
+    count, rays, size = (40, 500, 40) if quick else (300, 4096, 128)
     volume = demo_volume()
     if quick:
         volume = jvr.Volume(np.asarray(volume.values)[::3, ::3, ::3], np.diag([3.0, 3.0, 3.6, 1.0]))
@@ -62,13 +62,13 @@ def subjects(quick: bool) -> list[Subject]:
     head = None if quick else head_volume()
     if head is not None:
         scenes["CT of a head"] = (head, jvr.LinearTransfer([0.45, 0.55, 1.0], [[1, 1, 1]] * 3, [0.0, 0.5, 0.5]))
-    return [_subject(name, *scene, count, rays) for name, scene in scenes.items()]
+    return [_subject(name, *scene, count, rays, size) for name, scene in scenes.items()]
 
 
-def _subject(name: str, volume: jvr.Volume, transfer: Any, count: int, rays: int) -> Subject:
+def _subject(name: str, volume: jvr.Volume, transfer: Any, count: int, rays: int, size: int) -> Subject:
     center, away = np.asarray(volume.center), 3.5 * float(volume.radius)
     eye = center + away * np.array([0.5, -0.8, 0.33])
-    camera = jvr.PerspectiveCamera.look_at(eye, center, [0, 0, 1], 34.0, 128, 128)
+    camera = jvr.PerspectiveCamera.look_at(eye, center, [0, 0, 1], 34.0, size, size)
     scene = jvr.Scene(volume, transfer, lights=(jvr.AmbientLight(),), shading=jvr.Lambert())
     numbers = (volume.values, volume.world_from_grid, transfer.positions, transfer.sigma_t)
     medium = numpy_occlusion.Medium(*(np.asarray(x, np.float64) for x in numbers))
@@ -142,8 +142,7 @@ def surfaces(subject: Subject, quick: bool) -> list[dict[str, Any]]:
     """A row for each knob of the occlusion of an isosurface, at the points that a picture shows."""
     level = float(subject.medium.positions[np.flatnonzero(subject.medium.sigma_t)[0] - 1])
     surface = jvr.Isosurfaces([level], np.ones((1, 3)))
-    clear = jvr.LinearTransfer([0.0, 1.0], np.ones((2, 3)), [0.0, 0.0])
-    scene = dataclasses.replace(subject.scene, transfer=clear, surfaces=surface)
+    scene = dataclasses.replace(subject.scene, transfer=jvr.ClearTransfer(), surfaces=surface)
     free, rng = jvr.render(scene, subject.camera), np.random.default_rng(2)
     plain = _least(lambda: jvr.render(scene, subject.camera).rgb)
     pixels = rng.choice(np.flatnonzero(np.asarray(free.alpha).ravel() > 0.5), subject.seen, replace=False)

@@ -79,6 +79,12 @@ def shares() -> int:
     return 1 if among is None else among.size
 
 
+def sharing_memory() -> int:
+    """Over how many of these parts a batch of rays is divided that fits in the caches: cores of a processor share them, and accelerators
+    have each their own."""
+    return shares() if jax.default_backend() == "cpu" else 1
+
+
 def over_rays(function: Callable[[Shared, Rays], Result], shared: Shared, rays: Rays) -> Result:
     """`function(shared, rays)`, each device with its own share of the rays.
 

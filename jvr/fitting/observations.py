@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt16
 
-from jvr.execution.devices import everywhere, on_devices, over_rays, shares
+from jvr.execution.devices import everywhere, on_devices, over_rays, shares, sharing_memory
 from jvr.fitting.targets import check_weights
 from jvr.fitting.views import Pixels, Shift, Views, limits_of, with_planes
 from jvr.march.fields import MISSING, CachedSamples, VoxelField
@@ -157,8 +157,7 @@ def observe(
         order = order[np.concatenate([np.ravel(mask) for mask in among])[order]]
     if unknown:
         rays = [_pixels(i, camera) for i, camera in enumerate(cameras)]
-    # Cores share one memory and its caches: together they take as many rays at a time as one device does.
-    most = -(-(chunk or CHUNK) // (shares() if jax.default_backend() == "cpu" else 1))
+    most = -(-(chunk or CHUNK) // sharing_memory())
     chunk = min(most, -(-order.size // shares()))
     together = chunk * shares()
     rank = np.arange(-(-order.size // together) * together, dtype=np.int32).reshape(-1, shares()).T.reshape(-1, chunk)

@@ -308,8 +308,6 @@ def directions(p, seed=0):
 # Where light comes from is one piece of code for all methods: rays are traced to each kind of light, the others know one each.
 CASES = {
     "none": ("lamp",),
-    "rays, sun": ("sun",),
-    "rays, lamp": ("lamp",),
     "rays, torch": ("torch",),
     "rays, sun and lamp": ("sun", "lamp"),
     "volume, lamp": ("lamp",),
