@@ -24,7 +24,7 @@ def surfaces(of: Subject) -> dict[str, jvr.Scene]:
     outer, inner = of.isovalues
     skin, bone = of.colours
     one = jvr.Isosurfaces([inner], [bone])
-    change = lambda surfaces, **parts: dataclasses.replace(of.scene, transfer=clear(of), surfaces=surfaces, **parts)
+    change = lambda surfaces, **parts: dataclasses.replace(of.scene, transfer=jvr.ClearTransfer(), surfaces=surfaces, **parts)
     smooth = jvr.Isosurfaces([of.smooth], [skin if of.smooth == outer else bone])
     # From behind on the left.
     behind = (jvr.DirectionalLight(of.beside(0.3, 0.0, 1.0) - of.beside(0.0, 0.3, 0.0), 1.2), jvr.AmbientLight(0.1))
@@ -67,7 +67,9 @@ def around(of: Subject) -> dict[str, jvr.Scene]:
 def occlusion(of: Subject) -> dict[str, jvr.Scene]:
     """Ambient light alone, of which near matter takes a part, in the medium and on surfaces; and light of a lamp that is scattered on."""
     ambient = dataclasses.replace(of.scene, lights=(jvr.AmbientLight(1.0),), shading=jvr.Lambert(1.0, 0.0))
-    bone = dataclasses.replace(ambient, transfer=clear(of), surfaces=jvr.Isosurfaces([of.isovalues[1]], [of.colours[1]]))
+    bone = dataclasses.replace(
+        ambient, transfer=jvr.ClearTransfer(), surfaces=jvr.Isosurfaces([of.isovalues[1]], [of.colours[1]])
+    )
     near: Any = {"radius": 0.25 * float(of.scene.volume.radius), "resolution": 0.5}
     change = lambda scene, **parts: dataclasses.replace(scene, **parts)
     return {
@@ -78,12 +80,6 @@ def occlusion(of: Subject) -> dict[str, jvr.Scene]:
         "surface occlusion": change(bone, occlusion=jvr.SurfaceOcclusion()),
         "in-scattering": change(of.scene, shadows=jvr.InScattering(bias=0.1, **near)),
     }
-
-
-def clear(of: Subject) -> jvr.LutTransfer:
-    """Nothing is seen of the medium."""
-    table = of.table
-    return jvr.LutTransfer(table.rgb, jnp.zeros_like(table.sigma_t), table.domain)
 
 
 def flame(of: Subject) -> jvr.LutTransfer:

@@ -1,10 +1,10 @@
 """How well `jvr.tune` chooses: whether the error that was asked for is met on the whole picture, and how long that takes beside the best
 choice of an exhaustive sweep over the same knobs.
 
-`python experiments/tuning.py [--json FILE] [--figure FILE] [--quick]`: eight scenes that tune was not made on, five errors each, spread
-evenly (by ratio) over what the knobs can reach between 1e-3 and 1e-2. Every combination of every knob's values is drawn whole and
-compared with the same reference. Times of tune's choice and of the fastest of the sweep that meet the error are taken once more, in turns.
-Scans that `$JVR_DATA` has are measured in addition.
+`python experiments/tuning.py [--json FILE] [--figure FILE] [--quick] [--only TEXT]`: eight scenes that tune was not made on, five errors
+each, spread evenly (by ratio) over what the knobs can reach between 1e-3 and 1e-2. Every combination of every knob's values is drawn whole
+and compared with the same reference. Times of tune's choice and of the fastest of the sweep that meet the error are taken once more, in
+turns. Scans that `$JVR_DATA` has are measured in addition.
 """
 
 import argparse
@@ -196,12 +196,19 @@ def main() -> None:
     parser.add_argument("--json", metavar="FILE")
     parser.add_argument("--figure", metavar="FILE", help="PNG of error against time, with what was chosen")
     parser.add_argument("--quick", action="store_true", help="two scenes, small pictures, one error each")
+    parser.add_argument(
+        "--only", metavar="TEXT", default="", help="scenes with TEXT in their names; others stay as they are in the JSON"
+    )
     arguments = parser.parse_args()
     n, size, targets = (12, 16, 1) if arguments.quick else (24, 64, 5)
-    subjects = list((unlit(n, size) | lit(n, size)).items())
-    results = []
-    for name, (scene, camera) in subjects[2:4] if arguments.quick else subjects:
-        results.append(measured(name, scene, camera, targets))
+    subjects = unlit(n, size) | lit(n, size)
+    kept = Path(arguments.json) if arguments.only and arguments.json else None
+    held = json.loads(kept.read_text())["scenes"] if kept is not None and kept.exists() else []
+    found, results = {result["scene"]: result for result in held}, []
+    wanted = [name for name in subjects if arguments.only in name]
+    for name in wanted[2:4] if arguments.quick else wanted:
+        found[name] = measured(name, *subjects[name], targets)
+        results = [found[name] for name in (*subjects, *found.keys() - subjects) if name in found]
         # The programs of all scenes together exceed what a process may map into memory.
         jax.clear_caches()
         # After each scene, so that a run that is stopped leaves what it has.
