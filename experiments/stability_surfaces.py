@@ -30,8 +30,10 @@ def at_heights(
 
 
 def grazing(angle: float) -> tuple[Any, Any]:
-    """A camera whose middle row of pixels meets the surface under an angle."""
-    return MIDDLE + np.array([-20.0, 0.0, HEIGHT - MIDDLE[2] + 20 * angle]), np.array([MIDDLE[0], MIDDLE[1], HEIGHT])
+    """A camera whose middle row of pixels meets the surface under an angle: it looks along the horizontal part of what is up for it, so that
+    its rows are level."""
+    target = np.array([MIDDLE[0], MIDDLE[1], HEIGHT])
+    return target + 20.0 * np.array([-0.1 / 0.05**0.5, -0.2 / 0.05**0.5, angle]), target
 
 
 def occluded(radius: float, values: np.ndarray | None = None, label: str = "") -> Case:

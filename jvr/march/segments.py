@@ -152,7 +152,7 @@ def light_at(
 
 
 def channel_counts(medium: Medium, rays: Rays, dt: Scalar) -> tuple[int, int]:
-    """How many channels the medium emits and absorbs in, by shape alone, which how much light there is does not change."""
-    one, medium = active_rays(jax.tree.map(lambda x: x[:1], rays), dt), medium._replace(visibility=None)
+    """How many channels the medium emits and absorbs in, by shape alone."""
+    one = active_rays(jax.tree.map(lambda x: x[:1], rays), dt)
     emitted, dtau, _ = jax.eval_shape(lambda: take_segment(medium, one, dt, jnp.zeros_like(one.segments), one.segments))
     return len(emitted), len(dtau)

@@ -192,7 +192,9 @@ SCENES = {
     ),
     "in-scattering": lambda: lit(shadows=jvr.InScattering(8, radius=2, bias=0.1, direct=jvr.PiecewiseShadows(3, 0.5))),
     "glass": lambda: scene(
-        surfaces=jvr.Isosurfaces((0.4, 0.6), voxels((2, 3)), (0.3, 1.0)), specular=jvr.Specular([0.2, 0.7], 1.4, order=1)
+        transfer=jvr.ClearTransfer(),
+        surfaces=jvr.Isosurfaces((0.4, 0.6), voxels((2, 3)), (0.3, 1.0)),
+        specular=jvr.Specular([0.2, 0.7], 1.4, order=1),
     ),
     "isosurfaces": lambda: lit(surfaces=jvr.Isosurfaces((0.4, 0.6), voxels((2, 3)), (0.3, 1.0), band=0.2, step=0.5, most=2)),
     "negative": lambda: natural(environment=jvr.EnvironmentLight(-0.0 * np.ones((4, 3)), clamped=False)),
