@@ -41,12 +41,14 @@ FELT = 1e-6
 
 
 class Found(NamedTuple):
-    """What one case came to: errors of value and gradient, the array with the worst gradient, and what was not finite."""
+    """What one case came to: errors of value and gradient, the array with the worst gradient, what was not finite, and whether pixels
+    differ from each other."""
 
     value: float
     gradient: float
     worst: str
     infinite: tuple[str, ...]
+    varies: bool
 
 
 def rows(quick: bool = False) -> dict[str, list[Case]]:
@@ -130,7 +132,7 @@ def measured(case: Case, ways: Ways, *, modes: bool = True) -> Found:
         error = float(np.abs(g.astype(float) - t).max() / max(float(np.abs(t).max()), least))
         if not error <= worst:
             worst, name = (error if math.isfinite(error) else math.inf), label
-    return Found(value, worst, name, tuple(infinite))
+    return Found(value, worst, name, tuple(infinite), bool(np.ptp(true_rgb, axis=(0, 1)).max() > 0))
 
 
 def all_finite(tree: Any) -> bool:
@@ -174,7 +176,9 @@ def table(quick: bool = False, part: str = "", report: Callable[[str, Case, Foun
 
 
 def _row(name: str, found: list[Found]) -> dict[str, Any]:
-    """The worst of a row's cases."""
+    """The worst of a row's cases. **Raises** `ValueError` where each of them shows nothing but one colour, such as the background."""
+    if not any(f.varies for f in found):
+        raise ValueError(f"{name}: no case shows what it is about")
     return {
         "case": name,
         "value": max(f.value for f in found),

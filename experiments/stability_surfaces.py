@@ -30,8 +30,8 @@ def at_heights(
 
 
 def grazing(angle: float) -> tuple[Any, Any]:
-    """A camera whose middle row of pixels meets the surface under an angle: it looks along the horizontal part of what is up for it, so that
-    its rows are level."""
+    """A camera whose middle row of pixels meets the surface under an angle. It looks along the horizontal part of what is up for it, so
+    that its rows are level."""
     target = np.array([MIDDLE[0], MIDDLE[1], HEIGHT])
     return target + 20.0 * np.array([-0.1 / 0.05**0.5, -0.2 / 0.05**0.5, angle]), target
 
