@@ -102,6 +102,7 @@ def show(row: dict[str, Any]) -> None:
 def figure(results: dict[str, Any], path: str) -> None:
     """For each subject error against time, one line for each piece, and pictures under it."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     columns = max(len(result["pictures"]) for result in results.values())
     across = -(-columns // 2)
@@ -119,6 +120,8 @@ def figure(results: dict[str, Any], path: str) -> None:
         panel.set(
             title=name, xscale="log", yscale="log", xlabel="milliseconds of a picture", ylabel="RMSE over the largest value"
         )
+        panel.xaxis.set_major_formatter("{x:g}")
+        panel.xaxis.set_minor_formatter(NullFormatter())
         panel.legend(frameon=False, fontsize=7)
         white = result["pictures"]["shadow rays"].max()
         for axes in (panels := right.subplots(2, across)).flat:
