@@ -68,8 +68,8 @@ def tune(scene: Scene, camera: AbstractCamera, *, error: float | None = None, se
         if last == MOST_ROUNDS:
             chosen = [min(foretold.choices, key=limited)]
         else:
-            # What whole pictures said of those before corrects what is foretold of the others.
-            wrong = max([limited(m) / limited(f) for f, m in tried], default=1.0)
+            # What whole pictures said of those before corrects what is foretold of the others; a small one without any error says nothing.
+            wrong = max([limited(m) / limited(f) for f, m in tried if limited(f) > 0], default=1.0)
             rest = [f for f in foretold.choices if f not in [f for f, _ in tried]]
             chosen = _promising(rest, limited, free, limit / wrong)
         variants = [turned(given, turns, one.choice) for one in chosen]

@@ -151,3 +151,14 @@ def test_command(tmp_path, monkeypatch):
     tables = tomllib.loads(output.read_text(encoding="utf-8"))
     assert tables["settings"]["step"] == 2.0
     assert tables["fit"] == tomllib.loads(given.read_text(encoding="utf-8"))["fit"]
+
+
+@pytest.mark.slow
+def test_a_small_picture_without_an_error_says_nothing_of_a_whole_one():
+    """An isosurface of one colour: in the small picture rays meet it at every step, in the whole one not."""
+    volume = jvr.Volume(np.random.default_rng(2).random((6, 6, 6)))
+    scene = jvr.Scene(volume, surfaces=jvr.Isosurfaces([0.5], np.ones((1, 3))))
+    camera = jvr.fibonacci_sphere(np.asarray(volume.center), 20.0, 2, 30.0, 8, 8)[0]
+    found = jvr.tune(scene, camera, error=1e-2)
+    assert found.predicted.rmse == 0
+    assert found.met == (found.measured.rmse <= 1e-2)
