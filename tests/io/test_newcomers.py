@@ -99,7 +99,7 @@ calls = {
     "interpolation must be jvr.Trilinear() or jvr.Nearest(), not 'nearest'": lambda: jvr.Volume(a, interpolation="nearest"),
     "missing must be the stored number": lambda: jvr.Volume(a, missing="x"),
     "volume must be a jvr.Volume, as jvr.read_volume gives it, not ndarray": lambda: jvr.Scene(a, scene.transfer),
-    "transfer must be one of jvr's, not NoneType": lambda: jvr.Scene(scene.volume, None),
+    "this scene shows nothing: give it a transfer function": lambda: jvr.Scene(scene.volume, None),
     "a scene and a camera, not OrthographicCamera and Scene": lambda: jvr.render(camera, scene),
     "such as the rgb of a rendering, not Rendering": lambda: jvr.write_image("a.exr", picture),
     "put a single one in brackets": lambda: jvr.residuals(scene, camera, [np.zeros((4, 4, 3))]),
